@@ -1,0 +1,18 @@
+"""Energy models and networks, each a ``torch.nn.Module`` on the replica axis."""
+
+from memcomp_lightning.models.dbn import DBN
+from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear
+from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier
+from memcomp_lightning.models.rbm import RBM
+
+__all__ = [
+    "DBN",
+    "RBM",
+    "BatchNorm",
+    "BatchNormReluNetwork",
+    "Gaussian",
+    "Initialiser",
+    "Linear",
+    "Uniform",
+    "Xavier",
+]

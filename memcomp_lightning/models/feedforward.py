@@ -1,0 +1,125 @@
+"""Feed-forward layers and the baseline network, on the replica axis."""
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.rng import stream
+
+
+class Linear(nn.Module):
+    """``x W^T + bias`` with one weight matrix a replica.
+
+    Args:
+        n_in: Number of inputs, >= 1.
+        n_out: Number of outputs, >= 1.
+        replicas: Leading axes of independent layers.
+        weight_init: Draws the weights; the bias starts at zero.
+        generator: Random stream of the weights; None is a fresh stream of seed 0.
+    """
+
+    def __init__(
+        self,
+        n_in: int,
+        n_out: int,
+        *,
+        replicas: tuple[int, ...] = (),
+        weight_init: Initialiser | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__()
+        require_count("n_in", n_in)
+        require_count("n_out", n_out)
+        initialiser = Gaussian(std=0.01) if weight_init is None else weight_init
+        generator = stream(0, "weights") if generator is None else generator
+        self.weight = nn.Parameter(initialiser((*replicas, n_out, n_in), generator=generator))
+        self.bias = nn.Parameter(torch.zeros(*replicas, n_out))
+
+    def forward(self, x: Float[Tensor, "*replicas n n_in"]) -> Float[Tensor, "*replicas n n_out"]:
+        """Return ``x W^T + bias``."""
+        return x @ self.weight.mT + self.bias.unsqueeze(-2)
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation (Ioffe & Szegedy 2015) with statistics of its own for each replica.
+
+    Args:
+        n_features: Number of units, >= 1.
+        replicas: Leading axes of independent layers.
+        momentum: Weight of the newest batch in the running statistics, in (0, 1].
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+
+    def __init__(self, n_features: int, *, replicas: tuple[int, ...] = (), momentum: float = 0.1) -> None:
+        super().__init__()
+        require_count("n_features", n_features)
+        self.momentum = momentum
+        self.weight = nn.Parameter(torch.ones(*replicas, n_features))
+        self.bias = nn.Parameter(torch.zeros(*replicas, n_features))
+        self.register_buffer("running_mean", torch.zeros(*replicas, n_features))
+        self.register_buffer("running_var", torch.ones(*replicas, n_features))
+
+    def forward(self, x: Float[Tensor, "*replicas n n_features"]) -> Float[Tensor, "*replicas n n_features"]:
+        """Normalise over the images of each replica; in evaluation mode, by the running statistics."""
+        # Replicas become channels: torch's own kernel then keeps their statistics apart.
+        channels = x.movedim(-2, 0)
+        normalised = F.batch_norm(
+            channels.flatten(1),
+            self.running_mean.view(-1),
+            self.running_var.view(-1),
+            self.weight.flatten(),
+            self.bias.flatten(),
+            training=self.training,
+            momentum=self.momentum,
+        )
+        return normalised.view(channels.shape).movedim(0, -2)
+
+
+class BatchNormReluNetwork(nn.Module):
+    """The paper's baseline (Fig. 6): linear, batch normalisation, ReLU for each hidden layer; linear output.
+
+    Args:
+        n_visible: Number of inputs.
+        hidden_sizes: Units of each hidden layer, at least one layer.
+        n_classes: Number of outputs, >= 2.
+        replicas: Leading axes of independent networks.
+        weight_init: Draws all weights.
+        generator: Random stream of the weights; None is a fresh stream of seed 0.
+    """
+
+    def __init__(
+        self,
+        n_visible: int,
+        hidden_sizes: Sequence[int],
+        n_classes: int,
+        *,
+        replicas: tuple[int, ...] = (),
+        weight_init: Initialiser | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__()
+        require_count("number of hidden layers", len(hidden_sizes))
+        require_count("n_classes", n_classes, minimum=2)
+        generator = stream(0, "weights") if generator is None else generator
+        sizes = [n_visible, *hidden_sizes]
+        layers: list[nn.Module] = []
+        for n_in, n_out in itertools.pairwise(sizes):
+            linear = Linear(n_in, n_out, replicas=replicas, weight_init=weight_init, generator=generator)
+            layers += [linear, BatchNorm(n_out, replicas=replicas), nn.ReLU()]
+        layers.append(
+            Linear(sizes[-1], n_classes, replicas=replicas, weight_init=weight_init, generator=generator)
+        )
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_classes"]:
+        """Class logits."""
+        logits: Tensor = self.layers(v)
+        return logits
