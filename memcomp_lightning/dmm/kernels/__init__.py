@@ -1,0 +1,1 @@
+"""Kernels: programs that integrate a vector field, one file a device or compiler."""

@@ -1,0 +1,25 @@
+"""QUBO and weighted MAX-SAT: problems, exact mappings between them, simple solvers."""
+
+from memcomp_lightning.qubo.alternating_descent import AlternatingDescent
+from memcomp_lightning.qubo.brute_force import BruteForce
+from memcomp_lightning.qubo.from_model import from_model
+from memcomp_lightning.qubo.graph import Bipartite, EdgeList, Graph
+from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo, to_qubo
+from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, QuboSolver, Status, Trajectory
+
+__all__ = [
+    "AlternatingDescent",
+    "Bipartite",
+    "BruteForce",
+    "EdgeList",
+    "Graph",
+    "Qubo",
+    "QuboSolution",
+    "QuboSolver",
+    "Status",
+    "Trajectory",
+    "WeightedMaxSat",
+    "from_model",
+    "from_qubo",
+    "to_qubo",
+]

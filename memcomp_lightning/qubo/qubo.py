@@ -1,0 +1,201 @@
+"""Quadratic unconstrained binary optimisation: the problem, a solver's answer, the solver protocol."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import require
+from memcomp_lightning.qubo.graph import EdgeList, Graph
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Qubo:
+    r"""Minimise ``offset + linear . x + \sum_{pairs} coupling x_i x_j`` over x in {0, 1}^n.
+
+    Leading axes ``*problems`` hold independent problems of one graph.
+
+    Attributes:
+        graph: The coupled pairs and the layout of ``coupling``.
+        coupling: ``(*problems, *graph.edge_shape)``.
+        linear: ``(*problems, n)``.
+        offset: ``(*problems,)``, the energy of x = 0.
+    """
+
+    graph: Graph
+    coupling: Tensor
+    linear: Tensor
+    offset: Tensor
+
+    def __post_init__(self) -> None:
+        edge_shape, n = self.graph.edge_shape, self.graph.n
+        axes = len(edge_shape)
+        require(
+            tuple(self.coupling.shape[self.coupling.ndim - axes :]) == edge_shape,
+            "coupling shape",
+            tuple(self.coupling.shape),
+            f"(*problems, {', '.join(map(str, edge_shape))})",
+        )
+        problems = tuple(self.coupling.shape[: self.coupling.ndim - axes])
+        require(
+            tuple(self.linear.shape) == (*problems, n),
+            "linear shape",
+            tuple(self.linear.shape),
+            f"{(*problems, n)}",
+        )
+        require(tuple(self.offset.shape) == problems, "offset shape", tuple(self.offset.shape), f"{problems}")
+        for name, tensor in (("coupling", self.coupling), ("linear", self.linear), ("offset", self.offset)):
+            require(bool(tensor.isfinite().all()), name, "a tensor with NaN or infinite entries", "finite numbers")
+
+    @property
+    def n(self) -> int:
+        """Number of variables."""
+        return self.graph.n
+
+    @property
+    def problems(self) -> tuple[int, ...]:
+        """Leading axes of independent problems."""
+        return tuple(self.offset.shape)
+
+    def double(self) -> "Qubo":
+        """The same problem in float64."""
+        return Qubo(self.graph, self.coupling.double(), self.linear.double(), self.offset.double())
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Energy in float64, ``(*problems, n_states)``, of states ``x (*problems, n_states, n)`` in [0, 1]."""
+        x = x.double()
+        linear = (x @ self.linear.double().unsqueeze(-1)).squeeze(-1)
+        return self.offset.double().unsqueeze(-1) + linear + self.graph.quadratic(self.coupling.double(), x)
+
+    def field(self, x: Tensor) -> Tensor:
+        """Energy of x_i = 1 less energy of x_i = 0 for each variable, ``(*problems, n_states, n)``."""
+        return self.linear.unsqueeze(-2) + self.graph.field(self.coupling, x)
+
+    @staticmethod
+    def from_matrix(matrix: Tensor, offset: Tensor | None = None) -> "Qubo":
+        """Return the problem ``x' Q x + offset`` of a square matrix, symmetric or not.
+
+        Args:
+            matrix: ``(*problems, n, n)``; entries (i, j) and (j, i) add up, the diagonal is the linear part.
+            offset: ``(*problems,)``; None is zero.
+
+        >>> Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]])).energy(torch.ones(1, 2)).tolist()
+        [-1.0]
+        """
+        n = matrix.shape[-1]
+        require(
+            matrix.ndim >= 2 and matrix.shape[-2] == n,
+            "matrix shape",
+            tuple(matrix.shape),
+            "(*problems, n, n)",
+        )
+        pairs = torch.triu_indices(n, n, offset=1, device=matrix.device).T
+        coupling = matrix[..., pairs[:, 0], pairs[:, 1]] + matrix[..., pairs[:, 1], pairs[:, 0]]
+        used = (coupling != 0).flatten(0, -2).any(0) if coupling.ndim > 1 else coupling != 0
+        return Qubo(
+            graph=EdgeList(n=n, pairs=pairs[used]),
+            coupling=coupling[..., used],
+            linear=matrix.diagonal(dim1=-2, dim2=-1).clone(),
+            offset=matrix.new_zeros(matrix.shape[:-2]) if offset is None else offset,
+        )
+
+    def to_matrix(self) -> Tensor:
+        """The upper triangular matrix Q of ``x' Q x + offset``, ``(*problems, n, n)``."""
+        matrix = torch.diag_embed(self.linear)
+        edges = self.graph.edges().to(self.linear.device)
+        flat = self.coupling.reshape(*self.problems, -1)
+        matrix[..., edges[:, 0], edges[:, 1]] += flat
+        return matrix
+
+
+class Status(IntEnum):
+    """How one restart of a solver ended; ``advice`` says what to do about it."""
+
+    OPTIMAL = 0
+    CONVERGED = 1
+    STEP_BUDGET = 2
+    STILL_IMPROVING = 3
+    NOT_RUN = 4
+
+    @property
+    def advice(self) -> str:
+        """One sentence for a person."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OPTIMAL: "Every state was examined: this is the minimum.",
+    Status.CONVERGED: "No block of variables improves this assignment; more restarts may find a lower one.",
+    Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
+    Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
+    Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
+}
+
+
+class Trajectory(NamedTuple):
+    """What a solver passed through, recorded at intervals.
+
+    Attributes:
+        time: Machine time of each record, ``(*problems, n_restarts, n_records)``.
+        unsatisfied_weight: Total weight of unsatisfied clauses then, same shape.
+        assignments: The digital state then, ``(*problems, n_restarts, n_records, n)``, bool.
+        dwell: Machine time that the record stands for, ``(*problems, n_restarts, n_records)``.
+    """
+
+    time: Tensor
+    unsatisfied_weight: Tensor
+    assignments: Tensor
+    dwell: Tensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuboSolution:
+    """Answers of all restarts.
+
+    Attributes:
+        assignments: ``(*problems, n_restarts, n)`` in {0, 1}, dtype of the problem.
+        energies: ``(*problems, n_restarts)`` float64, computed from the assignments; infinite where not run.
+        status: ``(*problems, n_restarts)`` int64, values of :class:`Status`.
+        steps: ``(*problems, n_restarts)`` int64, integration steps or sweeps done.
+        wall_time_s: Seconds for all problems and restarts together.
+        trajectory: The recorded trajectory, if the solver was asked for it.
+    """
+
+    assignments: Tensor
+    energies: Tensor
+    status: Tensor
+    steps: Tensor
+    wall_time_s: float
+    trajectory: Trajectory | None = None
+
+    @property
+    def best_energy(self) -> Tensor:
+        """Lowest energy over the restarts, ``(*problems,)`` float64."""
+        return self.energies.min(-1).values
+
+    @property
+    def best(self) -> Tensor:
+        """Assignment of lowest energy, ``(*problems, n)``."""
+        index = self.energies.argmin(-1)[..., None, None]
+        return self.assignments.take_along_dim(index, dim=-2).squeeze(-2)
+
+    def messages(self) -> dict[str, int]:
+        """How many restarts ended in each way, keyed by name and advice."""
+        values, counts = self.status.unique(return_counts=True)
+        return {
+            f"{Status(int(value)).name}: {Status(int(value)).advice}": int(count)
+            for value, count in zip(values, counts, strict=True)
+        }
+
+
+class QuboSolver(Protocol):
+    """Anything that looks for minima of a :class:`Qubo`, several problems and restarts a call.
+
+    A solver that stops early says so in ``status``; it does not raise inside a training run.
+    """
+
+    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+        """Return the assignments found, one a restart."""
+        ...
