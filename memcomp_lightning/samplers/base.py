@@ -1,0 +1,49 @@
+"""What a sampler of the negative phase is."""
+
+from typing import ClassVar, Protocol, TypeVar
+
+from torch import Generator, Tensor
+
+from memcomp_lightning.types import NegativePhase
+
+ModelT = TypeVar("ModelT", contravariant=True)
+StateT = TypeVar("StateT")
+
+
+class NegativePhaseSampler(Protocol[ModelT, StateT]):
+    """Supplies the states whose mean energy stands for the expectation under the model.
+
+    One object serves every layer and replica: settings are frozen, what a call must remember is the state.
+
+    Attributes:
+        uses_data: The negative phase depends on ``v_data`` (contrastive divergence starts there). If not,
+            one call serves an update however many chunks its images come in.
+        shared: The answer depends on the model alone, so with several processes one of them computes it for
+            all. Otherwise every process draws its own.
+    """
+
+    uses_data: ClassVar[bool]
+    shared: ClassVar[bool]
+
+    def init(self, model: ModelT, n_chains: int, *, generator: Generator) -> StateT:
+        """Return the state before the first call.
+
+        Args:
+            model: The energy model.
+            n_chains: Number of chains a replica, unless the sampler has a number of its own.
+            generator: Random stream of the negative phase.
+        """
+        ...
+
+    def sample(
+        self, model: ModelT, state: StateT, v_data: Tensor, *, generator: Generator
+    ) -> NegativePhase[StateT]:
+        """Return the negative phase of one update.
+
+        Args:
+            model: The energy model; not changed.
+            state: What :meth:`init` or the previous call returned; not changed.
+            v_data: Visible states of the data, ``(*replicas, n, n_visible)`` in [0, 1].
+            generator: Random stream of the negative phase.
+        """
+        ...

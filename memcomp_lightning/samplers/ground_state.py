@@ -1,0 +1,83 @@
+"""The paper's negative phase: the ground state of the model, from any QUBO solver."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.qubo.from_model import from_model
+from memcomp_lightning.qubo.qubo import QuboSolution, QuboSolver, Status
+from memcomp_lightning.types import Configurations, NegativePhase, NoState
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GroundState:
+    """One QUBO an update; its solution stands for the expectation (Manukian et al. 2019, section 3.2).
+
+    Attributes:
+        solver: Finds low energies of the QUBO.
+        readout: "best" uses the best assignment x* as a one-point distribution, as the paper's figures do;
+            "time_average" weights the assignments of the recorded trajectory by the time spent in them, the
+            paper's <x(t)>, and needs a solver that records one.
+    """
+
+    uses_data: ClassVar[bool] = False
+    shared: ClassVar[bool] = True
+
+    solver: QuboSolver
+    readout: Literal["best", "time_average"] = "best"
+
+    def __post_init__(self) -> None:
+        require_choice("readout", self.readout, ("best", "time_average"))
+        if self.readout == "time_average":
+            require(
+                getattr(self.solver, "record", None) is not None,
+                "solver",
+                type(self.solver).__name__,
+                "a solver that records its trajectory, for readout = 'time_average'",
+                "Use DmmSolver(record=Recording(every=8)), or readout = 'best'.",
+            )
+
+    def init(self, model: RBM, n_chains: int, *, generator: Generator) -> NoState:
+        """Nothing to remember: every update solves a new problem."""
+        return NoState()
+
+    @torch.no_grad()
+    def sample(
+        self, model: RBM, state: NoState, v_data: Tensor, *, generator: Generator
+    ) -> NegativePhase[NoState]:
+        """Return x* or the weighted trajectory."""
+        solution = self.solver.minimise(from_model(model), generator=generator)
+        if self.readout == "best":
+            x, weight = solution.best.unsqueeze(-2), None
+        else:
+            x, weight = _visited(solution, model.weight.dtype)
+        v, h = x.split((model.n_visible, model.n_hidden), dim=-1)
+        return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
+
+
+def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Assignments of all records of all restarts, and the time spent in each."""
+    if solution.trajectory is None:
+        raise ValueError(
+            "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
+        )
+    assignments, dwell = solution.trajectory.assignments, solution.trajectory.dwell
+    return assignments.flatten(-3, -2).to(dtype), dwell.flatten(-2).to(dtype)
+
+
+def _diagnostics(solution: QuboSolution) -> dict[str, Tensor]:
+    """Numbers worth a curve; infinite energies of restarts that were not run are left out."""
+    was_run = solution.status != Status.NOT_RUN
+    n_run = was_run.sum(-1)
+    best = solution.best_energy
+    reached = (solution.energies <= (best + 1e-6 * best.abs()).unsqueeze(-1)).sum(-1)
+    return {
+        "ground_state_energy": best,
+        "restarts_run": n_run.double(),
+        "restarts_at_best": reached / n_run,
+        "solver_seconds": torch.tensor(solution.wall_time_s),
+    }

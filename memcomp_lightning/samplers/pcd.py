@@ -1,0 +1,52 @@
+"""Persistent contrastive divergence."""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible, sweep
+from memcomp_lightning.types import Configurations, NegativePhase
+
+
+class Chains(NamedTuple):
+    """Visible states of the persistent chains, ``(*replicas, n_chains, n_visible)``."""
+
+    v: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PCD:
+    """PCD-k: k Gibbs sweeps that start where the last update left the chains (Tieleman 2008).
+
+    Attributes:
+        k: Sweeps an update, >= 1.
+        n_chains: Chains a replica, >= 1; None takes the number of images of an update.
+    """
+
+    uses_data: ClassVar[bool] = False
+    shared: ClassVar[bool] = False
+
+    k: int = 1
+    n_chains: int | None = None
+
+    def __post_init__(self) -> None:
+        require_count("k", self.k)
+        if self.n_chains is not None:
+            require_count("n_chains", self.n_chains)
+
+    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> Chains:
+        """Start the chains at random states."""
+        return Chains(random_visible(model, self.n_chains or n_chains, generator=generator))
+
+    @torch.no_grad()
+    def sample(
+        self, model: TwoLayerModel, state: Chains, v_data: Tensor, *, generator: Generator
+    ) -> NegativePhase[Chains]:
+        """Return one configuration a chain."""
+        v = state.v
+        for _ in range(self.k):
+            v = sweep(model, v, generator=generator)
+        return NegativePhase(Configurations(v, model.hidden_mean(v)), Chains(v.clone()), {})

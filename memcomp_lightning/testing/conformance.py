@@ -1,0 +1,142 @@
+"""The conformance kit: what every sampler and every solver must do, whatever its method."""
+
+from typing import Any
+
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
+from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.types import Configurations
+
+
+def small_rbm(
+    n_visible: int = 7, n_hidden: int = 5, replicas: tuple[int, ...] = (), std: float = 0.8, seed: int = 0
+) -> RBM:
+    """A rectangular RBM with non-zero biases, so that a transpose or a sign shows."""
+    generator = rng.stream(seed, "test model")
+    rbm = RBM(n_visible, n_hidden, replicas=replicas, weight_init=Gaussian(std=std), generator=generator)
+    with torch.no_grad():
+        rbm.b.normal_(0.3, 0.5, generator=generator)
+        rbm.c.normal_(-0.2, 0.5, generator=generator)
+    return rbm
+
+
+def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) -> None:
+    """Run a sampler on small RBMs with and without replica axes and check the contract.
+
+    Checked: shapes, values in [0, 1], finite non-negative weights, a gradient for every parameter that does
+    not flow into the sampler, model and state left alone, no draw from the global random stream, the same
+    answer from the same stream, and that settings are frozen.
+
+    Raises:
+        AssertionError: Naming what the sampler got wrong.
+    """
+    name = type(sampler).__name__
+    for replicas in ((), (3,), (2, 3)):
+        rbm = small_rbm(replicas=replicas)
+        before = [parameter.detach().clone() for parameter in rbm.parameters()]
+        v_data = rng.uniform((*replicas, n_data, rbm.n_visible), generator=rng.stream(1, "data"))
+        global_state = torch.get_rng_state()
+        answers = []
+        for _ in range(2):
+            generator = rng.stream(2, "negative_phase")
+            state = sampler.init(rbm, n_data, generator=generator)
+            kept = tuple(tensor.clone() for tensor in state)
+            answers.append(sampler.sample(rbm, state, v_data, generator=generator))
+            _check(
+                all(a.equal(b) for a, b in zip(kept, state, strict=True)),
+                f"{name} changed the state it was given; return a new one",
+            )
+        _check(global_state.equal(torch.get_rng_state()), f"{name} drew from torch's global random stream")
+        _check(
+            all(a.equal(b) for a, b in zip(before, rbm.parameters(), strict=True)),
+            f"{name} changed the model",
+        )
+        first, second = (answer.configurations for answer in answers)
+        _check(first.v.equal(second.v) and first.h.equal(second.h), f"{name}: same stream, other answer")
+        _check_configurations(name, first, rbm)
+        loss = contrast(rbm, Configurations(v_data, rbm.hidden_mean(v_data).detach()), first)
+        _check(loss.shape == replicas, f"{name}: contrast has shape {tuple(loss.shape)}, not {replicas}")
+        loss.sum().backward()
+        for parameter_name, parameter in rbm.named_parameters():
+            gradient = parameter.grad
+            _check(
+                gradient is not None and bool(gradient.isfinite().all()),
+                f"{name}: no finite gradient for {parameter_name}",
+            )
+        for key, value in answers[0].info.items():
+            _check(not value.requires_grad, f"{name}: info[{key!r}] carries a gradient")
+            _check(tuple(value.shape) in ((), replicas), f"{name}: info[{key!r}] has shape {tuple(value.shape)}")
+
+
+def _check_configurations(name: str, configurations: Configurations, rbm: RBM) -> None:
+    v, h, weight = configurations
+    _check(v.shape[:-2] == rbm.replicas, f"{name}: v has shape {tuple(v.shape)}, replicas are {rbm.replicas}")
+    _check(v.shape[-1] == rbm.n_visible, f"{name}: last axis of v is {v.shape[-1]}, not {rbm.n_visible}")
+    _check(h.shape == (*v.shape[:-1], rbm.n_hidden), f"{name}: h has shape {tuple(h.shape)}")
+    for unit_name, units in (("v", v), ("h", h)):
+        _check(not units.requires_grad, f"{name}: {unit_name} carries a gradient")
+        _check(bool(((units >= 0) & (units <= 1)).all()), f"{name}: {unit_name} leaves [0, 1]")
+    if weight is not None:
+        _check(weight.shape == v.shape[:-1], f"{name}: weight has shape {tuple(weight.shape)}")
+        positive = bool((weight >= 0).all()) and bool((weight.sum(-1) > 0).all())
+        _check(positive and bool(weight.isfinite().all()), f"{name}: weights must be finite, >= 0, not all 0")
+
+
+def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
+    """Run a QUBO solver on small problems of every layout and check the contract.
+
+    Checked: shapes, assignments in {0, 1}, energies in float64 that are those of the assignments and never
+    below the true minimum, the same answer from the same stream, no draw from the global stream; the true
+    minimum unless told otherwise; and extreme problems: no couplings, one variable, all zeros, weights of
+    1e-30 and 1e30.
+
+    Raises:
+        AssertionError: Naming what the solver got wrong.
+    """
+    name = type(solver).__name__
+    matrix = torch.empty(7, 7).normal_(generator=rng.stream(3, "matrix"))
+    batch = torch.empty(2, 3, 5, 5).normal_(generator=rng.stream(4, "matrix"))
+    problems = {
+        "RBM": from_model(small_rbm()),
+        "two axes of RBMs": from_model(small_rbm(replicas=(2, 3))),
+        "dense": Qubo.from_matrix(matrix, offset=torch.tensor(1.5)),
+        "batch of dense": Qubo.from_matrix(batch),
+        "no couplings": Qubo.from_matrix(torch.diag(torch.tensor([1.0, -2.0, 0.0]))),
+        "one variable": Qubo.from_matrix(torch.tensor([[-3.0]])),
+        "all zeros": Qubo.from_matrix(torch.zeros(5, 5)),
+        "tiny weights": Qubo.from_matrix(matrix * 1e-30),
+        "huge weights": Qubo.from_matrix(matrix * 1e30),
+    }
+    for label, qubo in problems.items():
+        exact = BruteForce().minimise(qubo, generator=rng.stream(0, "unused")).best_energy
+        global_state = torch.get_rng_state()
+        solution, again = (solver.minimise(qubo, generator=rng.stream(5, "solver")) for _ in range(2))
+        where = f"{name} on {label}"
+        _check(global_state.equal(torch.get_rng_state()), f"{where} drew from torch's global random stream")
+        shape = solution.energies.shape
+        _check(shape[:-1] == qubo.problems, f"{where}: energies have shape {tuple(shape)}")
+        _check(solution.assignments.shape == (*shape, qubo.n), f"{where}: assignments of another shape")
+        _check(solution.energies.dtype == torch.float64, f"{where}: energies must be float64")
+        _check(bool(((solution.assignments == 0) | (solution.assignments == 1)).all()), f"{where}: not binary")
+        _check(solution.best.equal(again.best), f"{where}: same stream, other answer")
+        was_run = solution.energies.isfinite()
+        recomputed = qubo.energy(solution.assignments)
+        _check(
+            bool((solution.energies == recomputed)[was_run].all()),
+            f"{where}: energies are not those of the assignments",
+        )
+        tolerance = 1e-12 * (1 + exact.abs())
+        _check(bool((solution.best_energy >= exact - tolerance).all()), f"{where}: below the true minimum")
+        if finds_optimum:
+            tolerance = 1e-6 * exact.abs()
+            _check(bool((solution.best_energy <= exact + tolerance).all()), f"{where}: minimum not found")
+        _check(solution.status.shape == shape and solution.steps.shape == shape, f"{where}: status or steps")
+
+
+def _check(condition: bool, message: str) -> None:
+    if not condition:
+        raise AssertionError(message)
