@@ -1,0 +1,30 @@
+"""Where the images come from and how they reach the training: sources, batches, the Lightning data module.
+
+A source (:class:`Digits`, :class:`Mnist`, ...) is a frozen set of settings whose ``load`` returns an
+:class:`ImageData`; :class:`ImageDataModule` deals that into replicas and batches.
+"""
+
+from memcomp_lightning.data.digits import Digits
+from memcomp_lightning.data.idx import CorruptFileError
+from memcomp_lightning.data.images import ImageData, ImageSource, PixelLayout
+from memcomp_lightning.data.loading import Batches
+from memcomp_lightning.data.mnist import Mnist, ReducedMnist
+from memcomp_lightning.data.module import ImageDataModule
+from memcomp_lightning.data.reduce import SIX_BY_SIX_WITHOUT_CORNERS, reduce_images
+from memcomp_lightning.data.synthetic import BarsAndStripes, ShiftingBars
+
+__all__ = [
+    "SIX_BY_SIX_WITHOUT_CORNERS",
+    "BarsAndStripes",
+    "Batches",
+    "CorruptFileError",
+    "Digits",
+    "ImageData",
+    "ImageDataModule",
+    "ImageSource",
+    "Mnist",
+    "PixelLayout",
+    "ReducedMnist",
+    "ShiftingBars",
+    "reduce_images",
+]

@@ -1,0 +1,140 @@
+"""What a source of images hands over, checked once, before any training."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from memcomp_lightning.errors import require, require_count
+
+
+@dataclass(frozen=True, slots=True)
+class PixelLayout:
+    """Which pixels of a picture the visible units are.
+
+    Args:
+        height: Rows of the picture, >= 1.
+        width: Columns of the picture, >= 1.
+        pixels: Pixel of each visible unit, counted row by row from 0; None means all of them, in order.
+
+    >>> PixelLayout(height=2, width=2, pixels=(0, 3)).to_picture(torch.ones(2)).tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+
+    height: int
+    width: int
+    pixels: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        require_count("height", self.height)
+        require_count("width", self.width)
+        if self.pixels is not None:
+            n_pixels = self.height * self.width
+            inside = all(0 <= pixel < n_pixels for pixel in self.pixels)
+            distinct = len(set(self.pixels)) == len(self.pixels) > 0
+            allowed = f"at least one pixel, each once, from 0 to {n_pixels - 1} (height * width - 1)"
+            require(inside and distinct, "pixels", self.pixels, allowed)
+
+    @property
+    def n_visible(self) -> int:
+        """Number of visible units."""
+        return self.height * self.width if self.pixels is None else len(self.pixels)
+
+    def to_picture(self, v: Float[Tensor, "*leading n_visible"]) -> Float[Tensor, "*leading height width"]:
+        """Return the units as pictures, with 0 at the pixels that are no unit.
+
+        Raises:
+            SettingError: The last axis of ``v`` is not ``n_visible`` long.
+        """
+        require(v.shape[-1] == self.n_visible, "v.shape[-1]", v.shape[-1], f"{self.n_visible} visible units")
+        if self.pixels is None:
+            return v.reshape(*v.shape[:-1], self.height, self.width)
+        picture = v.new_zeros(*v.shape[:-1], self.height * self.width)
+        picture[..., list(self.pixels)] = v
+        return picture.view(*v.shape[:-1], self.height, self.width)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageData:
+    """A training set and a test set of labelled images.
+
+    Args:
+        train_v: Intensities in [0, 1], float32, ``(n_train, n_visible)``.
+        train_label: Class indices, int64, ``(n_train,)``.
+        test_v: Intensities in [0, 1], float32, ``(n_test, n_visible)``.
+        test_label: Class indices, int64, ``(n_test,)``.
+        n_classes: Number of classes; labels run from 0 to ``n_classes - 1``.
+        layout: Where the visible units lie in the picture.
+        name: Name of the data set, for reports.
+
+    Raises:
+        SettingError: A tensor has another type or shape, is empty, or holds a value out of range.
+    """
+
+    train_v: Tensor
+    train_label: Tensor
+    test_v: Tensor
+    test_label: Tensor
+    n_classes: int
+    layout: PixelLayout
+    name: str
+
+    def __post_init__(self) -> None:
+        require_count("n_classes", self.n_classes)
+        for subset, v, label in (
+            ("train", self.train_v, self.train_label),
+            ("test", self.test_v, self.test_label),
+        ):
+            _check_shapes(subset, v, label, self.layout)
+            _check_intensities(f"{subset}_v", v)
+            _check_labels(f"{subset}_label", label, self.n_classes)
+
+    @property
+    def n_visible(self) -> int:
+        """Number of visible units."""
+        return self.layout.n_visible
+
+
+class ImageSource(Protocol):
+    """A data set by its settings; making one reads nothing."""
+
+    def load(self) -> ImageData:
+        """Return the images, from memory, from disk or from the network."""
+        ...
+
+
+def _check_shapes(subset: str, v: Tensor, label: Tensor, layout: PixelLayout) -> None:
+    name = f"{subset}_v"
+    require(v.dtype == torch.float32, f"{name}.dtype", v.dtype, "torch.float32", "Convert with .float().")
+    allowed = f"(n, {layout.n_visible}): n >= 1 images of the {layout.n_visible} units of the pixel layout"
+    matches = v.ndim == 2 and v.shape[0] >= 1 and v.shape[1] == layout.n_visible
+    remedy = "Flatten each image, or give the layout that belongs to these images."
+    require(matches, f"{name}.shape", tuple(v.shape), allowed, remedy)
+    name = f"{subset}_label"
+    require(label.dtype == torch.int64, f"{name}.dtype", label.dtype, "torch.int64", "Convert with .long().")
+    require(
+        label.shape == v.shape[:1],
+        f"{name}.shape",
+        tuple(label.shape),
+        f"({v.shape[0]},), one label for each image of {subset}_v",
+    )
+
+
+def _check_intensities(name: str, v: Tensor) -> None:
+    low, high = v.aminmax()
+    # A comparison with NaN is false, and aminmax returns NaN where there is one: this refuses NaN as well.
+    if not (low >= 0 and high <= 1):
+        row, unit = (~((v >= 0) & (v <= 1))).nonzero()[0].tolist()
+        remedy = "Scale the intensities (bytes: divide by 255) and replace missing values."
+        require(False, f"{name}[{row}, {unit}]", v[row, unit].item(), "a finite value in [0, 1]", remedy)
+
+
+def _check_labels(name: str, label: Tensor, n_classes: int) -> None:
+    outside = ((label < 0) | (label >= n_classes)).nonzero()
+    if len(outside):
+        index = int(outside[0])
+        allowed = f"a class index from 0 to {n_classes - 1}"
+        remedy = "Number the classes from 0, or set n_classes."
+        require(False, f"{name}[{index}]", label[index].item(), allowed, remedy)

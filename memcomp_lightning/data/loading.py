@@ -1,0 +1,179 @@
+"""Batches of images that lie in memory: gathered by index, split over processes and into chunks."""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.types import Batch
+
+
+class Batches:
+    """One pass over the images, as :class:`~memcomp_lightning.types.Batch` objects; an epoch each time.
+
+    The order of an epoch depends on the seed and on the epoch alone, so a resumed run needs no saved order to
+    continue as the uninterrupted one; only a checkpoint from within an epoch has to say how far the epoch was
+    (:meth:`state_dict`). Each replica has its own order.
+
+    A step's images are dealt to the processes (process r takes every ``world_size``-th, from the r-th on),
+    then split evenly into the fewest chunks that hold at most ``chunk_size``. All processes have the same
+    number of chunks in a step. No image is repeated or left out.
+
+    Args:
+        v: Intensities, ``(*replicas, n, n_visible)``.
+        label: Class indices, ``(*replicas, n)``.
+        batch_size: Images of a replica in an optimiser step, over all processes, 1 to n; the last step of a
+            pass takes what is left. None means all n.
+        chunk_size: Images of a replica that one Batch holds at most, >= 1.
+        shuffle: Whether each epoch has another order.
+        seed: Seed of the order.
+        rank: Index of this process.
+        world_size: Number of processes.
+
+    Raises:
+        SettingError: A setting is out of range, or a step leaves a process without images.
+
+    >>> batches = Batches(torch.zeros(7, 2), torch.zeros(7).long(), 3, chunk_size=2, shuffle=True, seed=0)
+    >>> [(len(batch.label), batch.closes_step) for batch in batches]
+    [(1, False), (2, True), (1, False), (2, True), (1, True)]
+    """
+
+    def __init__(
+        self,
+        v: Tensor,
+        label: Tensor,
+        batch_size: int | None,
+        chunk_size: int,
+        shuffle: bool,
+        seed: int,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        require(v.ndim >= 2 and v.numel() > 0, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
+        require(label.shape == v.shape[:-1], "label.shape", tuple(label.shape), f"{tuple(v.shape[:-1])}, as v")
+        n = label.shape[-1]
+        if batch_size is not None:
+            require_count("batch_size", batch_size)
+            remedy = "Choose a smaller batch_size, or null for one step with all images."
+            require(batch_size <= n, "batch_size", batch_size, f"at most the {n} training images", remedy)
+        require_count("chunk_size", chunk_size)
+        require_count("seed", seed, minimum=0)
+        require_count("world_size", world_size)
+        require_count("rank", rank, minimum=0)
+        require(rank < world_size, "rank", rank, f"an integer from 0 to {world_size - 1} (world_size - 1)")
+        self._chunks = _plan(n, batch_size, chunk_size, rank, world_size)
+        # One chunk that is the whole pass: the order cannot matter, and the tensors go out uncopied.
+        self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
+        # Contiguous, the images of all replicas are the rows of one matrix.
+        self._v, self._label = (v.contiguous(), label.contiguous()) if self._shuffle else (v, label)
+        self._seed, self._epoch = seed, 0
+        self._progress = {"epoch": 0, "position": 0}
+        self._resume: dict[str, int] | None = None
+
+    @property
+    def sampler(self) -> "Batches":
+        """Itself: at each epoch Lightning calls ``dataloader.sampler.set_epoch(epoch)``."""
+        return self
+
+    @property
+    def batch_sampler(self) -> None:
+        """None: Lightning reads it from everything that has a ``sampler``."""
+        return None
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the order of the passes that start from now on.
+
+        Args:
+            epoch: Index of the pass, >= 0.
+        """
+        require_count("epoch", epoch, minimum=0)
+        self._epoch = epoch
+
+    def __len__(self) -> int:
+        return len(self._chunks)
+
+    def __iter__(self) -> Iterator[Batch]:
+        # A generator runs nothing until its first batch is asked for. That matters: Lightning calls iter()
+        # before set_epoch() in the first epoch of a run.
+        resume, self._resume = self._resume, None
+        start = resume["position"] % len(self) if resume and resume["epoch"] == self._epoch else 0
+        order = self._order() if self._shuffle else None
+        for position, (positions, share, closes_step) in enumerate(self._chunks[start:], start + 1):
+            self._progress = {"epoch": self._epoch, "position": position}
+            if order is None:
+                v, label = self._v[..., positions, :], self._label[..., positions]
+            else:
+                v, label = self._gather(order[..., positions])
+            yield Batch(v, label, share, closes_step)
+
+    def state_dict(self) -> dict[str, int]:
+        """Return how far the current pass is; Lightning saves it with a checkpoint."""
+        return dict(self._progress)
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Let the next pass start where the saved one was, if it is of the same epoch.
+
+        Args:
+            state: What :meth:`state_dict` returned.
+        """
+        self._resume = self._progress = dict(state)
+
+    def _gather(self, index: Int[Tensor, "*replicas n_chunk"]) -> tuple[Tensor, Tensor]:
+        # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
+        # of torch.take_along_dim, which looks up each single value.
+        flat = index.flatten()
+        v = self._v.flatten(0, -2).index_select(0, flat).view(*index.shape, -1)
+        return v, self._label.flatten().index_select(0, flat).view(index.shape)
+
+    def _order(self) -> Int[Tensor, "*replicas n"]:
+        """Return this epoch's order, as rows of all replicas' images laid end to end."""
+        *replicas, n = self._label.shape
+        generator = rng.stream(self._seed, "data_order", self._epoch)
+        first_rows = range(0, math.prod(replicas) * n, n)
+        order = torch.stack([torch.randperm(n, generator=generator) + first for first in first_rows])
+        return order.view(*replicas, n).to(self._v.device)
+
+
+class _Chunk(NamedTuple):
+    positions: slice
+    share: float
+    closes_step: bool
+
+
+def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size: int) -> list[_Chunk]:
+    """Return which positions of the order form each chunk of this process."""
+    plan = []
+    for start in range(0, n, batch_size or n):
+        step = range(start, min(start + (batch_size or n), n))
+        n_chunks = math.ceil(math.ceil(len(step) / world_size) / chunk_size)
+        _check_step(len(step), n_chunks, batch_size, chunk_size, world_size)
+        shard = step[rank::world_size]
+        bounds = [k * len(shard) // n_chunks for k in range(n_chunks + 1)]
+        for k in range(n_chunks):
+            part = shard[bounds[k] : bounds[k + 1]]
+            positions = slice(part.start, part.stop, part.step)
+            plan.append(_Chunk(positions, world_size * len(part) / len(step), k == n_chunks - 1))
+    return plan
+
+
+def _check_step(n_step: int, n_chunks: int, batch_size: int | None, chunk_size: int, world_size: int) -> None:
+    """Refuse a step in which a process would have an empty chunk: the mean over it is NaN."""
+    require(
+        n_step >= world_size,
+        "batch_size",
+        batch_size,
+        f"at least one image for each process in every step, but a step has {n_step} images for "
+        f"{world_size} processes",
+        "Choose a batch_size that leaves more in the last step, or use fewer processes.",
+    )
+    require(
+        n_step // world_size >= n_chunks,
+        "chunk_size",
+        chunk_size,
+        f"an integer >= 2, because {world_size} processes share a step of {n_step} images unevenly",
+    )

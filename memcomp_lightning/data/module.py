@@ -1,0 +1,145 @@
+"""The images of one experiment, dealt into replicas and held-out parts, as Lightning wants them."""
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.data.images import ImageData, PixelLayout
+from memcomp_lightning.data.loading import Batches
+from memcomp_lightning.errors import require, require_count
+
+
+class ImageDataModule(LightningDataModule):
+    """Training, validation and test batches of one :class:`ImageData`.
+
+    With ``partitions > 1`` the training set is dealt into that many disjoint parts of
+    ``floor(n / partitions)`` images, and the parts become the replica axis: each replica of the model learns
+    from its own part, and all of them are tested on the same images. Up to ``partitions - 1`` images are
+    left over. How the set is dealt depends on ``partition_seed`` alone, so the parts stay the same when the
+    seed of the training varies.
+
+    Evaluation runs unshuffled, all of it in each process. It is one step in chunks: the sum of
+    ``share * mean over the chunk`` is the mean over the set.
+
+    Attributes:
+        replicas: Leading axes of the batches: ``()``, or ``(partitions,)``.
+        n_train: Training images of one replica, without those held out.
+
+    Args:
+        images: The data.
+        batch_size: Images of a replica in an optimiser step, over all processes; None means all of them.
+        partitions: Number of parts, >= 1; 1 means the whole set and no replica axis.
+        validation_fraction: Share of each part's training images that is held out for validation, in
+            [0, 1), rounded to whole images. With 0 the *test* images are shown as validation set: look at
+            them while training, but never choose a setting or a checkpoint by them.
+        chunk_size: Images of a replica in one Batch at most, >= 1: bounds the memory of large steps.
+        seed: Seed of the order in which training images come.
+        partition_seed: Seed of the partition and of the held-out images.
+
+    Raises:
+        SettingError: A setting is out of range for these images.
+    """
+
+    def __init__(
+        self,
+        images: ImageData,
+        *,
+        batch_size: int | None = 100,
+        partitions: int = 1,
+        validation_fraction: float = 0.0,
+        chunk_size: int = 10_000,
+        seed: int = 0,
+        partition_seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self._check(images, partitions, validation_fraction, partition_seed)
+        self.images = images
+        self.replicas: tuple[int, ...] = (partitions,) if partitions > 1 else ()
+        self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
+        n_part = len(images.train_label) // partitions
+        n_held_out = round(validation_fraction * n_part)
+        self.n_train = n_part - n_held_out
+        self._train = images.train_v, images.train_label
+        self._held_out = images.test_v, images.test_label
+        # Without parts and without a held-out set there is nothing to deal, and no copy of the images.
+        if partitions > 1 or n_held_out:
+            generator = rng.stream(partition_seed, "partition")
+            order = torch.randperm(len(images.train_label), generator=generator)
+            order = order[: partitions * n_part].view(*self.replicas, n_part)
+            self._train = self._take(order[..., : self.n_train])
+            if n_held_out:
+                self._held_out = self._take(order[..., self.n_train :])
+        self._train_batches(rank=0, world_size=1)
+
+    @property
+    def n_visible(self) -> int:
+        """Number of visible units."""
+        return self.images.n_visible
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes."""
+        return self.images.n_classes
+
+    @property
+    def pixel_layout(self) -> PixelLayout:
+        """Where the visible units lie in the picture."""
+        return self.images.layout
+
+    def train_dataloader(self) -> Batches:
+        """Return the shuffled training batches of this process.
+
+        Raises:
+            SettingError: A step has fewer images than there are processes.
+        """
+        if self.trainer is None:
+            return self._train_batches(rank=0, world_size=1)
+        return self._train_batches(self.trainer.global_rank, self.trainer.world_size)
+
+    def val_dataloader(self) -> Batches:
+        """Return the held-out images, or the test images if none are held out."""
+        return self._evaluation_batches(*self._held_out)
+
+    def test_dataloader(self) -> Batches:
+        """Return the test images, the same for every replica."""
+        return self._evaluation_batches(self.images.test_v, self.images.test_label)
+
+    def _train_batches(self, rank: int, world_size: int) -> Batches:
+        return Batches(
+            *self._train,
+            batch_size=self._batch_size,
+            chunk_size=self._chunk_size,
+            shuffle=True,
+            seed=self._seed,
+            rank=rank,
+            world_size=world_size,
+        )
+
+    def _evaluation_batches(self, v: Tensor, label: Tensor) -> Batches:
+        if label.ndim == 1:
+            v, label = v.expand(*self.replicas, -1, -1), label.expand(*self.replicas, -1)
+        return Batches(v, label, batch_size=None, chunk_size=self._chunk_size, shuffle=False, seed=self._seed)
+
+    def _take(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        return self.images.train_v[index], self.images.train_label[index]
+
+    @staticmethod
+    def _check(images: ImageData, partitions: int, validation_fraction: float, partition_seed: int) -> None:
+        n = len(images.train_label)
+        require_count("partitions", partitions)
+        allowed = f"at most the {n} training images"
+        require(partitions <= n, "partitions", partitions, allowed)
+        require_count("partition_seed", partition_seed, minimum=0)
+        in_range = 0 <= validation_fraction < 1
+        require(in_range, "validation_fraction", validation_fraction, "a number in [0, 1)")
+        n_part = n // partitions
+        n_held_out = round(validation_fraction * n_part)
+        require(
+            validation_fraction == 0 or 1 <= n_held_out < n_part,
+            "validation_fraction",
+            validation_fraction,
+            f"0, or a share that holds out at least 1 and leaves at least 1 of {n_part} images; "
+            f"this one holds out {n_held_out}",
+            "Change validation_fraction or use fewer partitions.",
+        )
