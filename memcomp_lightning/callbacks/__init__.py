@@ -1,0 +1,26 @@
+"""Callbacks for any LightningModule that offers the protocol of :mod:`memcomp_lightning.callbacks.base`."""
+
+from memcomp_lightning.callbacks.classification import ClassificationMetrics
+from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
+from memcomp_lightning.callbacks.histograms import ParameterHistograms
+from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
+from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
+from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
+from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
+from memcomp_lightning.callbacks.pictures import ModelSamples, ReceptiveFields
+from memcomp_lightning.callbacks.progress import StageProgressBar
+from memcomp_lightning.callbacks.reconstruction import ReconstructionError
+
+__all__ = [
+    "ClassificationMetrics",
+    "FreeEnergyGap",
+    "HyperParameters",
+    "ModelSamples",
+    "MomentumSchedule",
+    "NegativePhaseEnergies",
+    "OptimizerMonitor",
+    "ParameterHistograms",
+    "ReceptiveFields",
+    "ReconstructionError",
+    "StageProgressBar",
+]

@@ -1,0 +1,84 @@
+"""Loss and accuracy of supervised training."""
+
+from typing import Any
+
+import lightning.pytorch as pl
+
+from memcomp_lightning.callbacks.base import log_scalars, required
+
+
+class ClassificationMetrics(pl.Callback):
+    """Logs ``loss`` and ``accuracy`` of the pass, ``heldout_`` and ``test_`` likewise: means over replicas.
+
+    Works with any module whose ``training_step``, ``validation_step`` and ``test_step`` return a dictionary
+    with ``score`` (:class:`memcomp_lightning.modules.Score`). The values of each replica stay in ``latest``.
+
+    Attributes:
+        latest: The newest score of each kind: "train", "heldout", "test".
+    """
+
+    def __init__(self) -> None:
+        self.latest: dict[str, Any] = {}
+
+    def _add(self, kind: str, outputs: Any) -> None:
+        score = required(outputs, "score", self)
+        self.latest[kind] = self.latest[kind] + score if kind in self.latest else score
+
+    def _log(self, kind: str, pl_module: pl.LightningModule) -> None:
+        if kind in self.latest:
+            score, tag = self.latest[kind], "" if kind == "train" else f"{kind}_"
+            log_scalars(pl_module, {f"{tag}loss": score.mean_loss, f"{tag}accuracy": score.accuracy})
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new sum."""
+        self.latest.pop("train", None)
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Add a batch."""
+        self._add("train", outputs)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Log the pass; the network changed while it was summed up."""
+        self._log("train", pl_module)
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new sum."""
+        self.latest.pop("heldout", None)
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Add a batch."""
+        self._add("heldout", outputs)
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Log the held-out images."""
+        self._log("heldout", pl_module)
+
+    def on_test_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new sum."""
+        self.latest.pop("test", None)
+
+    def on_test_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Add a batch."""
+        self._add("test", outputs)
+
+    def on_test_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Log the test images."""
+        self._log("test", pl_module)

@@ -1,0 +1,75 @@
+"""Free energy of training against held-out images: the overfitting monitor."""
+
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from memcomp_lightning.callbacks.base import log_scalars, required
+from memcomp_lightning.errors import require_count
+
+
+class FreeEnergyGap(pl.Callback):
+    """Logs ``free_energy_train``, ``free_energy_heldout`` and their difference ``free_energy_gap``.
+
+    The unknown log Z cancels in ``mean F(held-out) - mean F(train) = mean log p(train) - mean log
+    p(held-out)``: a gap that grows is overfitting (Hinton 2010, section 6). Training images are those of
+    the pass's last batches, judged by the same model as the held-out ones.
+
+    Args:
+        n_images: Most training images a replica to judge, >= 1.
+    """
+
+    def __init__(self, n_images: int = 1000) -> None:
+        require_count("n_images", n_images)
+        self.n_images = n_images
+        self._train: list[Tensor] = []
+        self._heldout: list[tuple[Tensor, int]] = []
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Forget the last pass."""
+        self._train = []
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Keep the visible states of the last batches, as many as asked for."""
+        self._train.append(required(outputs, "positive", self).v[..., : self.n_images, :])
+        while sum(v.shape[-2] for v in self._train[1:]) >= self.n_images:
+            self._train.pop(0)
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new mean."""
+        self._heldout = []
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Free energy of one chunk of held-out images."""
+        v = required(outputs, "v", self)
+        self._heldout.append((_free_energy(pl_module, v).sum(-1), v.shape[-2]))
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Judge the training images by the same model."""
+        if not self._train or not self._heldout:
+            return
+        heldout = sum(total for total, _ in self._heldout) / sum(n for _, n in self._heldout)
+        train = _free_energy(pl_module, torch.cat(self._train, dim=-2)).mean(-1)
+        log_scalars(
+            pl_module,
+            {"free_energy_train": train, "free_energy_heldout": heldout, "free_energy_gap": heldout - train},
+        )
+
+
+@torch.no_grad()
+def _free_energy(module: pl.LightningModule, v: Tensor) -> Tensor:
+    rbm: Any = module.rbm
+    free_energy: Tensor = rbm.free_energy(v)
+    return free_energy

@@ -1,0 +1,26 @@
+"""Histograms of weights and biases."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+
+from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, tensorboards
+
+
+class ParameterHistograms(EveryIterations):
+    """Writes a TensorBoard histogram of each parameter, over all replicas.
+
+    Args:
+        every: Passes between two histograms, >= 1.
+    """
+
+    def __init__(self, every: int = 10) -> None:
+        super().__init__(every)
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Parameters of the model in training, or of the whole module."""
+        model: Any = getattr(pl_module, "rbm", pl_module)
+        for board in tensorboards(trainer):
+            for name, parameter in model.named_parameters():
+                board.add_histogram(f"{prefix_of(pl_module)}/{name}", parameter.flatten(), trainer.global_step)

@@ -1,0 +1,113 @@
+"""Receptive fields and samples as pictures in TensorBoard."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import lightning.pytorch as pl
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, tensorboards
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.plotting.grid import picture_grid
+from memcomp_lightning.samplers.gibbs import random_visible, sweep
+
+
+class Layout(Protocol):
+    """Where visible units lie in a picture; the data module's ``pixel_layout``."""
+
+    def to_picture(self, v: Tensor) -> Tensor:
+        """Picture ``(*leading, height, width)`` of visible states ``(*leading, n_visible)``."""
+        ...
+
+
+class Pictures(EveryIterations):
+    """Writes one picture grid of the first replica every so many passes.
+
+    The data module's ``pixel_layout`` says where each input lies; without one nothing is drawn.
+
+    Args:
+        tag: Name of the picture, after stage and layer.
+        every: Passes between two pictures, >= 1.
+        n_pictures: Most tiles in the grid, >= 1.
+    """
+
+    def __init__(self, tag: str, every: int, n_pictures: int) -> None:
+        super().__init__(every)
+        require_count("n_pictures", n_pictures)
+        self.tag = tag
+        self.n_pictures = n_pictures
+
+    @abstractmethod
+    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
+        """Inputs to draw, ``(*replicas, n, n_visible)``."""
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Draw the grid."""
+        boards = tensorboards(trainer)
+        layout: Layout | None = getattr(getattr(trainer, "datamodule", None), "pixel_layout", None)
+        if not boards or layout is None:
+            return
+        tiles = self.tiles(pl_module)
+        first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
+        grid = picture_grid(layout.to_picture(first_replica).cpu().numpy())
+        for board in boards:
+            tag = f"{prefix_of(pl_module)}/{self.tag}"
+            board.add_image(tag, grid, trainer.global_step, dataformats="HW")
+
+
+class ReceptiveFields(Pictures):
+    """Draws each hidden unit's weights, projected through the layers below it onto the inputs.
+
+    In the lowest layer these are the rows of W; above it, products of the weight matrices.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        n_units: Most units to draw, >= 1.
+    """
+
+    def __init__(self, every: int = 10, n_units: int = 64) -> None:
+        super().__init__("receptive_fields", every, n_units)
+
+    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
+        """Weights of the layer in training times those below."""
+        rbm: Any = pl_module.rbm
+        fields: Tensor = rbm.weight
+        dbn: Any = getattr(pl_module, "dbn", None)
+        layer: Any = getattr(pl_module, "layer", 0)
+        layers_below = range(layer) if dbn is not None else ()
+        for below in reversed(layers_below):
+            fields = fields @ dbn[below].weight
+        return fields
+
+
+class ModelSamples(Pictures):
+    """Draws images that the model dreams: Gibbs chains from random states, shown as conditional means.
+
+    The chains have a random stream of their own, so they do not touch training.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        n_samples: Chains, >= 1.
+        n_sweeps: Gibbs sweeps of each chain, >= 1.
+        seed: Seed of the chains; the same starts each time, so that pictures compare.
+    """
+
+    def __init__(self, every: int = 10, n_samples: int = 64, n_sweeps: int = 100, seed: int = 0) -> None:
+        super().__init__("samples", every, n_samples)
+        require_count("n_sweeps", n_sweeps)
+        self.n_sweeps = n_sweeps
+        self.seed = seed
+
+    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
+        """Run the chains and project them down to the inputs."""
+        rbm: Any = pl_module.rbm
+        generator = rng.stream(self.seed, "evaluation")
+        v = random_visible(rbm, self.n_pictures, generator=generator)
+        for _ in range(self.n_sweeps):
+            v = sweep(rbm, v, generator=generator)
+        v = rbm.visible_mean(rbm.hidden_mean(v))
+        images_of = getattr(pl_module, "images_of", None)
+        images: Tensor = v if images_of is None else images_of(v)
+        return images

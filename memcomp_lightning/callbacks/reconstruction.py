@@ -1,0 +1,25 @@
+"""How well one up-and-down pass brings the data back."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, required
+
+
+class ReconstructionError(EveryIterations):
+    """Logs ``reconstruction_error``, the mean of ``(v - E[v | E[h | v]])^2`` over units and images.
+
+    It is cheap and says that training runs; it is no measure of likelihood (Hinton 2010, section 5).
+
+    Args:
+        every: Passes between two values, >= 1.
+    """
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Reconstruct the last batch of the pass."""
+        v = required(outputs, "positive", self).v
+        rbm: Any = pl_module.rbm
+        error = (v - rbm.visible_mean(rbm.hidden_mean(v))).square().mean((-1, -2))
+        log_scalars(pl_module, {"reconstruction_error": error})

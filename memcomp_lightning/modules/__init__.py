@@ -1,0 +1,23 @@
+"""LightningModules: a stage of training each."""
+
+from memcomp_lightning.modules.baseline import BaselineClassifier
+from memcomp_lightning.modules.classifier import Classifier, Score, evaluate, score
+from memcomp_lightning.modules.finetuning import DBNClassifier
+from memcomp_lightning.modules.pretraining import DBNPretraining
+from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
+from memcomp_lightning.modules.weights import CheckpointError, load_weights, save_weights
+
+__all__ = [
+    "BaselineClassifier",
+    "CheckpointError",
+    "Classifier",
+    "DBNClassifier",
+    "DBNPretraining",
+    "OptimizerFactory",
+    "Score",
+    "StageModule",
+    "evaluate",
+    "load_weights",
+    "save_weights",
+    "score",
+]

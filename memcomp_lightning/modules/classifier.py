@@ -1,0 +1,117 @@
+"""Supervised training of any network on the replica axis."""
+
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
+from memcomp_lightning.types import Batch
+
+
+class Score(NamedTuple):
+    """Sums over images, so that chunks add up.
+
+    Attributes:
+        loss: Sum of cross-entropies in nats, ``(*replicas,)``.
+        n_correct: Images whose largest logit is their label's, ``(*replicas,)``.
+        n_images: Images a replica.
+    """
+
+    loss: Tensor
+    n_correct: Tensor
+    n_images: int
+
+    def __add__(self, other: object) -> "Score":
+        """Score of both sets of images together."""
+        if not isinstance(other, Score):
+            return NotImplemented
+        return Score(self.loss + other.loss, self.n_correct + other.n_correct, self.n_images + other.n_images)
+
+    @property
+    def accuracy(self) -> Tensor:
+        """Share of images classified correctly, ``(*replicas,)`` in [0, 1]."""
+        return self.n_correct / self.n_images
+
+    @property
+    def mean_loss(self) -> Tensor:
+        """Mean cross-entropy in nats, ``(*replicas,)``."""
+        return self.loss / self.n_images
+
+
+def score(logits: Tensor, label: Tensor) -> Score:
+    """Return the score of logits ``(*replicas, n, n_classes)`` against labels ``(*replicas, n)``."""
+    # torch's cross-entropy wants the classes on the second axis.
+    losses = F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none").view(label.shape)
+    n_correct = (logits.argmax(-1) == label).sum(-1)
+    return Score(losses.sum(-1), n_correct, label.shape[-1])
+
+
+@torch.no_grad()
+def evaluate(network: nn.Module, batches: Any) -> Score:
+    """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
+    was_training = network.training
+    network.eval()
+    device = next(network.parameters()).device
+    scores = [score(network(batch.v.to(device)), batch.label.to(device)) for batch in batches]
+    network.train(was_training)
+    return sum(scores[1:], start=scores[0])
+
+
+class Classifier(StageModule):
+    """Minimise the cross-entropy of a network by back-propagation.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits ``(*replicas, n, n_classes)``.
+        iterations: Passes over the training set, >= 1.
+        optimizer: Builds the optimiser from the network's parameters.
+        seed: Seed of the random streams.
+
+    Raises:
+        SettingError: ``iterations`` out of range.
+    """
+
+    stage = "finetune"
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        iterations: int = 100,
+        optimizer: OptimizerFactory = PAPER_SGD,
+        seed: int = 0,
+    ) -> None:
+        require_count("finetune.iterations", iterations)
+        super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
+        self.network = network
+
+    def forward(self, v: Tensor) -> Tensor:
+        """Class logits."""
+        logits: Tensor = self.network(v)
+        return logits
+
+    def configure_optimizers(self) -> Optimizer:
+        """One optimiser for all parameters."""
+        return self.make_optimizer(self.network.parameters())
+
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Follow the gradient of the mean cross-entropy; replicas add up and stay independent.
+
+        Returns:
+            ``loss`` (scalar) and ``score``.
+        """
+        sums = score(self(batch.v), batch.label)
+        loss = batch.share * sums.mean_loss.sum()
+        self.update(loss, closes_step=batch.closes_step)
+        return {"loss": loss.detach(), "score": Score(sums.loss.detach(), sums.n_correct, sums.n_images)}
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Return the ``score`` of held-out images."""
+        return {"score": score(self(batch.v), batch.label)}
+
+    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Return the ``score`` of test images."""
+        return self.validation_step(batch, batch_idx)

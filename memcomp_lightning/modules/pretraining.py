@@ -1,0 +1,180 @@
+"""Greedy pretraining of a deep belief network, one RBM after the other."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.models import DBN, RBM
+from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.types import Batch, Configurations, NegativePhase
+
+
+class DBNPretraining(StageModule):
+    """Train each RBM of a DBN on the mean activations of the layers below it.
+
+    One epoch is one *iteration*, a pass over the training set; the layer is
+    ``current_epoch // iterations``. Activations below the trained layer are computed chunk by chunk and
+    never held for the whole data set. Each layer has an optimiser of its own.
+
+    Args:
+        dbn: The network; trained in place.
+        sampler: Supplies the negative phase.
+        iterations: Passes over the training set for each layer, >= 1.
+        optimizer: Builds the optimiser of one layer from its parameters.
+        seed: Seed of the random streams.
+
+    Attributes:
+        energy_gaps: For each layer begun, mean energy of the data less that of the negative phase, in its
+            newest update, ``(*replicas,)``: the contrast.
+
+    Raises:
+        SettingError: ``iterations`` out of range, or a layer that the sampler cannot handle.
+    """
+
+    stage = "pretrain"
+
+    def __init__(
+        self,
+        dbn: DBN,
+        sampler: NegativePhaseSampler[RBM, Any],
+        *,
+        iterations: int = 50,
+        optimizer: OptimizerFactory = PAPER_SGD,
+        seed: int = 0,
+    ) -> None:
+        require_count("pretrain.iterations", iterations)
+        super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
+        for rbm in dbn:
+            sampler.init(rbm, 1, generator=rng.stream(seed, "check"))
+        self.dbn = dbn
+        self.sampler = sampler
+        self.energy_gaps: list[Tensor] = []
+        self._sampler_state: Any = None
+        self._negative: NegativePhase[Any] | None = None
+
+    @property
+    def n_epochs(self) -> int:
+        """Value for the trainer's ``max_epochs``: all layers."""
+        return self.iterations * len(self.dbn)
+
+    @property
+    def layer(self) -> int:
+        """Index of the RBM in training, 0 being the lowest."""
+        return min(self.current_epoch // self.iterations, len(self.dbn) - 1)
+
+    @property
+    def iteration(self) -> int:
+        """Passes done over the training set for this layer."""
+        return self.current_epoch - self.layer * self.iterations
+
+    @property
+    def rbm(self) -> RBM:
+        """The RBM in training."""
+        return self.dbn[self.layer]
+
+    @property
+    def log_prefix(self) -> str:
+        """Prefix of tags: stage and layer, counted from 1."""
+        return f"{self.stage}/layer{self.layer + 1}"
+
+    @property
+    def progress(self) -> str:
+        """Where the stage is, for people."""
+        layer = f"layer {self.layer + 1}/{len(self.dbn)}"
+        return f"{self.stage} · {layer} · iteration {self.iteration + 1}/{self.iterations}"
+
+    @property
+    def active_optimizer(self) -> Optimizer:
+        """The optimiser of the layer in training."""
+        return self.trainer.optimizers[self.layer]
+
+    def images_of(self, v: Tensor) -> Tensor:
+        """Inputs that the visible states of the layer in training stand for, for pictures."""
+        return self.dbn.images_of(self.layer, v)
+
+    def configure_optimizers(self) -> list[Optimizer]:
+        """One optimiser a layer, so that momentum and adaptive rates start afresh."""
+        return [self.make_optimizer(rbm.parameters()) for rbm in self.dbn]
+
+    def on_train_epoch_start(self) -> None:
+        """A new layer starts without chains."""
+        if self.iteration == 0:
+            self._sampler_state = None
+            self.energy_gaps = [*self.energy_gaps, torch.zeros(self.dbn.replicas)]
+
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Follow the gradient of the contrast of both phases.
+
+        Returns:
+            ``loss`` (scalar), ``contrast`` ``(*replicas,)``, ``positive`` and ``negative``
+            (:class:`Configurations`) and the sampler's ``info``: what the callbacks look at.
+        """
+        rbm = self.rbm
+        with torch.no_grad():
+            v = self.dbn.visible_of(self.layer, batch.v)
+            positive = Configurations(v, rbm.hidden_mean(v))
+        if self._negative is None or self.sampler.uses_data:
+            self._negative = self._negative_phase(rbm, v)
+        negative = self._negative
+        gap = contrast(rbm, positive, negative.configurations)
+        loss = batch.share * gap.sum()
+        self.update(loss + self._untouched_parameters(), closes_step=batch.closes_step, optimizer_index=self.layer)
+        self.energy_gaps[self.layer] = gap.detach()
+        if batch.closes_step:
+            self._negative = None
+        return {
+            "loss": loss.detach(),
+            "contrast": gap.detach(),
+            "positive": positive,
+            "negative": negative.configurations,
+            "info": negative.info,
+        }
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Return the layer's visible states ``v`` of held-out images, for the callbacks."""
+        return {"v": self.dbn.visible_of(self.layer, batch.v)}
+
+    def _negative_phase(self, rbm: RBM, v: Tensor) -> NegativePhase[Any]:
+        """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
+        generator = self.streams["negative_phase"]
+        if self._sampler_state is None:
+            self._sampler_state = self.sampler.init(rbm, v.shape[-2], generator=generator)
+        negative: NegativePhase[Any] | None = None
+        one_for_all = self.sampler.shared and self.trainer.world_size > 1
+        if self.trainer.is_global_zero or not one_for_all:
+            negative = self.sampler.sample(rbm, self._sampler_state, v, generator=generator)
+        if one_for_all:
+            negative = self.trainer.strategy.broadcast(negative)
+        if negative is None:
+            raise RuntimeError("the process of rank 0 sent no negative phase")
+        self._sampler_state = negative.state
+        return negative
+
+    def _untouched_parameters(self) -> Tensor | float:
+        """Zero, but depending on the layers at rest: distributed training waits for every gradient.
+
+        Only the active layer's optimiser steps, so their zero gradients change nothing.
+        """
+        if self.trainer.world_size == 1:
+            return 0.0
+        at_rest = [rbm for layer, rbm in enumerate(self.dbn) if layer != self.layer]
+        return 0.0 * sum((p.sum() for rbm in at_rest for p in rbm.parameters()), torch.zeros(()).to(self.device))
+
+    def extra_state(self) -> dict[str, Any]:
+        """The sampler's chains and the energy gaps."""
+        chains = None if self._sampler_state is None else dict(self._sampler_state._asdict())
+        return {"sampler": chains, "energy_gaps": list(self.energy_gaps)}
+
+    def take_extra_state(self, state: dict[str, Any]) -> None:
+        """Take back the sampler's chains and the energy gaps."""
+        self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
+        if state["sampler"] is not None:
+            template = self.sampler.init(self.rbm, 1, generator=rng.stream(self.seed, "check"))
+            chains = {name: tensor.to(self.device) for name, tensor in state["sampler"].items()}
+            self._sampler_state = type(template)(**chains)

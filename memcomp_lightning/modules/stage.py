@@ -1,0 +1,139 @@
+"""What the LightningModules of all stages share: optimiser, random streams, state in checkpoints."""
+
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+import torch.distributed
+from torch import Generator, Tensor
+from torch.nn import Parameter
+from torch.optim import SGD, Optimizer
+
+from memcomp_lightning import rng
+
+OptimizerFactory = Callable[[Iterable[Parameter]], Optimizer]
+"""Builds an optimiser for some parameters: ``functools.partial(torch.optim.SGD, lr=0.1)``."""
+
+PAPER_SGD: OptimizerFactory = partial(SGD, lr=0.1)
+"""Learning rate of Manukian et al. 2019; its momentum comes from the MomentumSchedule callback."""
+
+
+class StageModule(pl.LightningModule):
+    """A stage of training that steps its optimiser itself, once the last chunk of a batch is in.
+
+    Checkpoints hold the random streams and the extra state of every process, as plain tensors: they load
+    with ``weights_only=True``.
+
+    Attributes:
+        stage: Name of the stage; prefix of everything that it logs.
+        iterations: Passes over the training set.
+        streams: Named generators of this process, made by :meth:`setup`.
+    """
+
+    stage: str
+    stream_names: tuple[str, ...] = ("negative_phase",)
+
+    def __init__(self, *, iterations: int, optimizer: OptimizerFactory, seed: int) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.iterations = iterations
+        self.make_optimizer = optimizer
+        self.seed = seed
+        self.streams: dict[str, Generator] = {}
+        self._loaded: list[dict[str, Any]] | None = None
+        self._seconds_before = 0.0
+        self._started_at: float | None = None
+
+    @property
+    def n_epochs(self) -> int:
+        """Value for the trainer's ``max_epochs``."""
+        return self.iterations
+
+    @property
+    def iteration(self) -> int:
+        """Passes done over the training set in this stage (of this layer, in pretraining)."""
+        return self.current_epoch
+
+    @property
+    def log_prefix(self) -> str:
+        """Prefix of tags."""
+        return self.stage
+
+    @property
+    def progress(self) -> str:
+        """Where the stage is, for people."""
+        return f"{self.stage} · iteration {self.iteration + 1}/{self.iterations}"
+
+    @property
+    def wall_time_s(self) -> float:
+        """Seconds of training so far, those before an interruption included."""
+        running = 0.0 if self._started_at is None else time.perf_counter() - self._started_at
+        return self._seconds_before + running
+
+    @property
+    def active_optimizer(self) -> Optimizer:
+        """The optimiser that steps now."""
+        return self.trainer.optimizers[0]
+
+    def setup(self, stage: str) -> None:
+        """Make this process's random streams."""
+        self.streams = rng.streams(self.seed, self.stream_names, index=self.global_rank)
+
+    def update(self, loss: Tensor, *, closes_step: bool, optimizer_index: int = 0) -> None:
+        """Add the gradient of ``loss``; step and clear once the step's last chunk is in."""
+        self.manual_backward(loss)
+        if closes_step:
+            optimizers = self.optimizers()
+            optimizer = optimizers[optimizer_index] if isinstance(optimizers, list) else optimizers
+            optimizer.step()
+            optimizer.zero_grad()
+
+    def extra_state(self) -> dict[str, Any]:
+        """State of this process that a checkpoint must hold beside weights and streams: tensors in dicts."""
+        return {}
+
+    def take_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of :meth:`extra_state`."""
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add streams and extra state of all processes."""
+        own = {
+            "streams": rng.save(self.streams),
+            "extra": self.extra_state(),
+            "wall_time_s": self.wall_time_s,
+        }
+        states: list[Any] = [own]
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            states = [None] * torch.distributed.get_world_size()
+            torch.distributed.all_gather_object(states, own)
+        checkpoint["process_states"] = states
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep streams and extra state until training starts."""
+        self._loaded = checkpoint["process_states"]
+
+    def on_train_start(self) -> None:
+        """Take back streams and extra state, now that device and number of processes are settled.
+
+        Raises:
+            ValueError: The checkpoint was written by another number of processes.
+        """
+        self._started_at = time.perf_counter()
+        if self._loaded is None:
+            return
+        states, self._loaded = self._loaded, None
+        if len(states) != self.trainer.world_size:
+            raise ValueError(
+                f"the checkpoint holds the random streams of {len(states)} processes, this run has "
+                f"{self.trainer.world_size}: resume with trainer.devices={len(states)}, or start a new run."
+            )
+        rng.restore(self.streams, states[self.global_rank]["streams"])
+        self.take_extra_state(states[self.global_rank]["extra"])
+        self._seconds_before = states[self.global_rank]["wall_time_s"]
+
+    def on_train_end(self) -> None:
+        """Stop the clock."""
+        self._seconds_before, self._started_at = self.wall_time_s, None
