@@ -1,0 +1,153 @@
+"""From a configuration to the objects of a run; everything that can be refused is refused here."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import get_class, instantiate
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+
+from memcomp_lightning import rng
+from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import Classifier, DBNClassifier, DBNPretraining, OptimizerFactory, StageModule
+from memcomp_lightning.modules.weights import load_weights
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One fit: a module, its data, and the configuration of its callbacks."""
+
+    module: StageModule
+    data: ImageDataModule
+    callbacks: DictConfig
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that a run needs.
+
+    Attributes:
+        network: What is trained; the stages share it.
+        pretraining: The first stage, None for a network without pretraining.
+        finetuning: The last stage, None if left out.
+    """
+
+    network: nn.Module
+    pretraining: Stage | None
+    finetuning: Stage | None
+
+    @property
+    def stages(self) -> list[Stage]:
+        """The stages in order."""
+        return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
+
+
+def build(config: DictConfig) -> Plan:
+    """Build the objects of a run.
+
+    Raises:
+        UserError, SettingError, InstantiationException: A setting does not exist, has the wrong type or is
+            out of range; data or weights cannot be read.
+    """
+    seed = config.seed
+    require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
+    images = _load(instantiate(config.data.source))
+    network, initial = _network(config, images)
+    for stage in ("pretrain", "finetune"):
+        require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
+    pretraining = finetuning = None
+    if isinstance(network, DBN) and config.pretrain.iterations > 0:
+        pretraining = Stage(
+            DBNPretraining(
+                network,
+                instantiate(config.sampler),
+                iterations=config.pretrain.iterations,
+                optimizer=_optimizer(config, "pretrain"),
+                seed=seed,
+            ),
+            _data(config, "pretrain", images),
+            config.callbacks.pretrain,
+        )
+    if config.finetune.iterations > 0:
+        settings: dict[str, Any] = {
+            "iterations": config.finetune.iterations,
+            "optimizer": _optimizer(config, "finetune"),
+            "seed": seed,
+        }
+        classifier: Classifier
+        if isinstance(network, DBN):
+            generator = rng.stream(seed, "output weights")
+            classifier = DBNClassifier(
+                network, n_classes=images.n_classes, output_init=initial, generator=generator, **settings
+            )
+        else:
+            classifier = Classifier(network, **settings)
+        finetuning = Stage(classifier, _data(config, "finetune", images), config.callbacks.finetune)
+    plan = Plan(network, pretraining, finetuning)
+    require(
+        bool(plan.stages),
+        "finetune.iterations",
+        config.finetune.iterations,
+        "an integer >= 1 where there is no pretraining",
+    )
+    return plan
+
+
+def _network(config: DictConfig, images: ImageData) -> tuple[nn.Module, Any]:
+    """The network and its initialiser."""
+    settings = OmegaConf.to_container(config.model, resolve=True)
+    assert isinstance(settings, dict)
+    weights = settings.pop("weights", None)
+    partitions = config.data.partitions
+    require_count("data.partitions", partitions)
+    arguments: dict[str, Any] = {
+        "n_visible": images.layout.n_visible,
+        "replicas": (partitions,) if partitions > 1 else (),
+        "generator": rng.stream(config.seed, "weights"),
+    }
+    factory = instantiate(settings, _partial_=True, _convert_="all")
+    if not issubclass(get_class(settings["_target_"]), DBN):
+        arguments["n_classes"] = images.n_classes
+    try:
+        network: nn.Module = factory(**arguments)
+    except TypeError as error:
+        raise UserError(f"model: {error}") from error
+    if weights is not None:
+        load_weights(network, Path(weights))
+    return network, factory.keywords.get("weight_init")
+
+
+def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
+    try:
+        return ImageDataModule(
+            images,
+            batch_size=config[stage].batch_size,
+            partitions=config.data.partitions,
+            validation_fraction=config.data.validation_fraction,
+            chunk_size=config.data.chunk_size,
+            seed=config.seed,
+        )
+    except ValueError as error:
+        raise UserError(f"{stage}, data: {error}") from error
+
+
+def _optimizer(config: DictConfig, stage: str) -> OptimizerFactory:
+    """The optimiser's factory, tried on one parameter so that bad settings show before training."""
+    factory: OptimizerFactory = instantiate(config[stage].optimizer)
+    try:
+        factory([nn.Parameter(torch.zeros(1))])
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{stage}.optimizer: {error}") from error
+    return factory
+
+
+@cache
+def _load(source: ImageSource) -> ImageData:
+    """Load a data set once a process: the jobs of a sweep share it."""
+    return source.load()

@@ -1,0 +1,68 @@
+"""Errors as a user meets them: one message, no stack of frames from libraries."""
+
+import difflib
+
+from hydra.errors import ConfigCompositionException, HydraException, InstantiationException
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+
+class UserError(Exception):
+    """Something that the user can put right; the message says how."""
+
+
+CONFIGURATION_ERRORS = (
+    UserError,
+    ValueError,
+    OSError,
+    HydraException,
+    OmegaConfBaseException,
+    MisconfigurationException,
+)
+"""What building a run may raise on account of its settings. (SettingError and CheckpointError are ValueErrors.)"""
+
+
+def explain(error: BaseException) -> str:
+    """Return the message for a configuration error: the innermost cause, and the setting it belongs to."""
+    if isinstance(error, InstantiationException):
+        setting = _full_key(error)
+        cause = error.__cause__
+        while cause is not None and cause.__cause__ is not None:
+            cause = cause.__cause__
+        text = str(cause) if cause is not None else str(error).splitlines()[0]
+        return f"{setting}: {text}" if setting else text
+    if isinstance(error, ConfigCompositionException) and error.__cause__ is not None:
+        return f"{error} {error.__cause__}".replace("\n", " ")
+    return str(error)
+
+
+def unknown_setting(override: str, defaults: DictConfig) -> str | None:
+    """Return a message if an override names a setting that does not exist, with what is close to it.
+
+    Args:
+        override: As typed: ``pretrain.iteration=20``.
+        defaults: A composed configuration of the same groups.
+    """
+    name, _, value = override.partition("=")
+    if not name or name[0] in "+~" or "@" in name or name.startswith("hydra"):
+        return None
+    parent, _, leaf = name.rpartition(".")
+    node = OmegaConf.select(defaults, parent) if parent else defaults
+    if isinstance(node, DictConfig):
+        if leaf in node:
+            return None
+        known = sorted(f"{parent}.{key!s}" if parent else str(key) for key in node)
+    else:
+        known = sorted(str(key) for key in defaults)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f" Did you mean {close[0]}?" if close else ""
+    return f"setting {name} (given as {name}={value}) does not exist.{hint} Known here: {', '.join(known)}."
+
+
+def _full_key(error: InstantiationException) -> str:
+    """The setting that Hydra was building."""
+    for line in str(error).splitlines():
+        if line.startswith("full_key: "):
+            return line.removeprefix("full_key: ")
+    return ""

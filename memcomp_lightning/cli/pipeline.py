@@ -1,0 +1,131 @@
+"""The stages of one run, each picked up where it was left."""
+
+import logging
+from typing import Any, cast
+
+import lightning.pytorch as pl
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
+from memcomp_lightning.cli.build import Plan, Stage
+from memcomp_lightning.cli.run_folder import RunFolder
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.modules import Classifier, DBNPretraining, evaluate, load_weights, save_weights
+from memcomp_lightning.modules.weights import check_fits, read_checkpoint
+
+log = logging.getLogger(__name__)
+
+
+def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> dict[str, Any]:
+    """Train what is not trained yet, evaluate, and return the result.
+
+    Every stage that is done left its weights; an interrupted one goes on from its last checkpoint.
+    """
+    loggers: list[Logger] = [instantiate(logger) for logger in config.logger.values() if logger is not None]
+    done = folder.finished_stages
+    records: dict[str, Any] = {}
+    is_global_zero = True
+    for stage in plan.stages:
+        name = stage.module.stage
+        if name in done:
+            load_weights(_trained(stage), folder.weights(name))
+            records[name] = done[name]
+            continue
+        trainer = _fit(stage, config, folder, loggers)
+        is_global_zero = trainer.is_global_zero
+        records[name] = _record(stage)
+        if is_global_zero:
+            save_weights(_trained(stage), folder.weights(name))
+            folder.finish_stage(name, records[name])
+    result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
+    if plan.finetuning is not None:
+        score = evaluate(_trained(plan.finetuning), plan.finetuning.data.test_dataloader())
+        result["test_accuracy"] = _numbers(score.accuracy)
+        result["test_loss"] = _numbers(score.mean_loss)
+    if is_global_zero:
+        _log_final(loggers, config, result)
+        folder.finish(result)
+    return result
+
+
+def make_trainer(
+    config: DictConfig, *, max_epochs: int, callbacks: list[pl.Callback], loggers: list[Logger]
+) -> pl.Trainer:
+    """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group."""
+    settings = OmegaConf.to_container(config.trainer, resolve=True)
+    assert isinstance(settings, dict)
+    settings.pop("checkpoint_every")
+    trainer: pl.Trainer = instantiate(
+        settings,
+        _convert_="all",
+        max_epochs=max_epochs,
+        callbacks=callbacks,
+        logger=loggers or False,
+        use_distributed_sampler=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+    return trainer
+
+
+def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
+    require_count("trainer.checkpoint_every", config.trainer.checkpoint_every)
+    path = folder.checkpoint(stage.module.stage)
+    keep_last = ModelCheckpoint(
+        dirpath=path.parent,
+        filename=path.stem,
+        every_n_epochs=config.trainer.checkpoint_every,
+        save_on_train_epoch_end=True,
+        enable_version_counter=False,
+    )
+    callbacks = [instantiate(callback) for callback in stage.callbacks.values() if callback is not None]
+    trainer = make_trainer(
+        config, max_epochs=stage.module.n_epochs, callbacks=[*callbacks, keep_last], loggers=loggers
+    )
+    resume_from = None
+    if path.exists():
+        check_fits(stage.module, read_checkpoint(path)["state_dict"], path)
+        resume_from = path
+        log.info("Going on from %s", path)
+    trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
+    return trainer
+
+
+def _trained(stage: Stage) -> torch.nn.Module:
+    """What a stage trains: the DBN, or the network with its output layer."""
+    module = stage.module
+    if isinstance(module, DBNPretraining):
+        return module.dbn
+    return cast(Classifier, module).network
+
+
+def _record(stage: Stage) -> dict[str, Any]:
+    module = stage.module
+    record: dict[str, Any] = {"iterations": module.iterations, "wall_time_s": module.wall_time_s}
+    if isinstance(module, DBNPretraining):
+        record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
+    return record
+
+
+def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]) -> None:
+    """The final numbers, beside the settings in TensorBoard's HParams tab."""
+    metrics = {"wall_time_s": sum(record["wall_time_s"] for record in result["stages"].values())}
+    for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
+        metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
+    if "test_accuracy" in result:
+        metrics["final/test_accuracy"] = sum(result["test_accuracy"]) / len(result["test_accuracy"])
+    groups = ("data", "model", "sampler", "solver", "pretrain", "finetune")
+    settings = {group: OmegaConf.to_container(config[group], resolve=True) for group in groups}
+    write_hyper_parameters(loggers, {"seed": config.seed, **settings}, metrics)
+    for logger in loggers:
+        logger.finalize("success")
+
+
+def _numbers(values: Tensor) -> list[float]:
+    """One number a replica."""
+    return [float(value) for value in values.flatten()]

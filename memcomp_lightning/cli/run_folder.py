@@ -1,0 +1,123 @@
+"""The folder of one run: settings, checkpoints, weights, result. Every file is written whole."""
+
+import json
+import os
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from memcomp_lightning import __version__
+from memcomp_lightning.cli.errors import UserError
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that an interruption leaves the old one or the new one."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Paths and files of one run."""
+
+    path: Path
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """What a finished run found, None if it has not finished."""
+        return self._read("result.json")
+
+    @property
+    def error(self) -> dict[str, Any] | None:
+        """Why the last attempt failed, None if it did not."""
+        return self._read("error.json")
+
+    @property
+    def finished_stages(self) -> dict[str, Any]:
+        """Records of the stages that are done, by name."""
+        return self._read("stages.json") or {}
+
+    def weights(self, stage: str) -> Path:
+        """The weight file that a stage leaves."""
+        return self.path / "weights" / f"{stage}.pt"
+
+    def checkpoint(self, stage: str) -> Path:
+        """The checkpoint that a stage goes on from."""
+        return self.path / "checkpoints" / stage / "last.ckpt"
+
+    def open(self, config: DictConfig) -> None:
+        """Make the folder, or check that it belongs to the same settings.
+
+        Raises:
+            UserError: The folder cannot be written, or was made with other settings.
+        """
+        settings = self.path / "settings.yaml"
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if settings.exists():
+                self._check_same(settings, config)
+            else:
+                write_text(settings, OmegaConf.to_yaml(config))
+        except OSError as error:
+            raise UserError(
+                f"run folder {self.path} cannot be written ({error.strerror}): choose another with "
+                "hydra.run.dir=PATH"
+            ) from error
+
+    def finish_stage(self, stage: str, record: dict[str, Any]) -> None:
+        """Note that a stage is done; its checkpoint is not needed any more."""
+        self._write("stages.json", {**self.finished_stages, stage: record})
+        self.checkpoint(stage).unlink(missing_ok=True)
+
+    def finish(self, result: dict[str, Any]) -> None:
+        """Write the result, with what produced it."""
+        origin = {
+            "memcomp_lightning": __version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        }
+        self._write("result.json", {**result, "origin": origin})
+        (self.path / "error.json").unlink(missing_ok=True)
+
+    def fail(self, record: dict[str, Any]) -> None:
+        """Write why the run failed."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._write("error.json", record)
+
+    def _check_same(self, path: Path, config: DictConfig) -> None:
+        there, now = _flat(OmegaConf.load(path)), _flat(config)
+        for name in sorted(there.keys() | now.keys()):
+            if there.get(name) != now.get(name):
+                raise UserError(
+                    f"run folder {self.path} was made with {name}={there.get(name)}, not {now.get(name)}: choose "
+                    "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
+                )
+
+    def _read(self, name: str) -> dict[str, Any] | None:
+        try:
+            content: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        return content
+
+    def _write(self, name: str, content: dict[str, Any]) -> None:
+        write_text(self.path / name, json.dumps(content, indent=1) + "\n")
+
+
+def _flat(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Settings by dotted name, unresolved."""
+    if OmegaConf.is_config(node):
+        node = OmegaConf.to_container(node, resolve=False)
+    flat: dict[str, Any] = {}
+    for key, value in node.items():
+        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value})
+    return flat

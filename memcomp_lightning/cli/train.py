@@ -1,0 +1,126 @@
+"""``memcomp-train``: pretrain, fine-tune, evaluate."""
+
+import logging
+import os
+import sys
+import traceback
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from lightning_utilities.core.rank_zero import rank_zero_only
+from omegaconf import DictConfig, OmegaConf
+
+from memcomp_lightning.cli import pipeline, sweep
+from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.errors import UserError, explain
+from memcomp_lightning.cli.run_folder import RunFolder
+from memcomp_lightning.cli.table import closing_lines, run_table
+
+USAGE_ERROR = 2
+"""Exit status when a setting is refused."""
+
+log = logging.getLogger(__name__)
+
+
+@hydra.main(config_path=f"pkg://{sweep.CONFIG_MODULE}", config_name="config", version_base="1.3")
+def train(config: DictConfig) -> None:
+    """One run, or one job of a sweep."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    settings = HydraConfig.get()
+    folder = RunFolder(Path(settings.runtime.output_dir))
+    in_sweep = settings.mode == RunMode.MULTIRUN
+    try:
+        _train(config, folder, _overrides(settings.overrides.task))
+    except (Exception, SystemExit) as error:
+        if not in_sweep or isinstance(error, SystemExit):
+            raise
+        folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
+        log.error("Failed, the sweep goes on: %s", explain(error))
+
+
+def _train(config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> None:
+    plan = build(config)
+    if _is_first_process():
+        folder.open(config)
+    result = folder.result
+    if result is None:
+        try:
+            result = pipeline.run(plan, config, folder, overrides)
+        except SystemExit as stop:
+            raise KeyboardInterrupt from stop
+    else:
+        log.info("%s is finished already", folder.path)
+    if _is_first_process():
+        print(f"\n{run_table(result)}\n{closing_lines(_short(folder.path))}", flush=True)
+
+
+def _is_first_process() -> bool:
+    """Whether this is the process that writes; Lightning reads the rank from the environment."""
+    return int(getattr(rank_zero_only, "rank", 0)) == 0
+
+
+def _overrides(task_overrides: list[str]) -> dict[str, str]:
+    pairs = (override.partition("=") for override in task_overrides)
+    return {name: value for name, _, value in pairs}
+
+
+def _short(path: Path) -> Path:
+    """The path as a person at this folder would type it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _resumed(arguments: list[str]) -> list[str]:
+    """Put the overrides and the folder of an earlier run in place of ``resume=FOLDER``."""
+    folders = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
+    if not folders:
+        return arguments
+    folder = Path(folders[-1])
+    saved = folder / ".hydra" / "overrides.yaml"
+    if not saved.is_file():
+        raise UserError(
+            f"resume={folder}: there is no {saved}. Name the folder of a run of memcomp-train (one that holds "
+            "settings.yaml); a sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
+        )
+    overrides = [str(override) for override in OmegaConf.load(saved)]
+    return [*overrides, *(a for a in arguments if not a.startswith("resume=")), f"hydra.run.dir={folder}"]
+
+
+def main() -> None:
+    """Entry point: check everything, train, and end with a table or a message."""
+    try:
+        sys.argv[1:] = _resumed(sys.argv[1:])
+        flags = {argument for argument in sys.argv[1:] if argument.startswith("-")}
+        multirun = bool(flags & {"-m", "--multirun"})
+        if multirun and any(a.startswith("trainer.devices=") and a != "trainer.devices=1" for a in sys.argv):
+            raise UserError(
+                "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
+                "processes. Give the jobs one by one, or use one device with a parallel launcher."
+            )
+        if flags <= {"-m", "--multirun"} and "LOCAL_RANK" not in os.environ:
+            overrides = [a for a in sys.argv[1:] if a not in flags]
+            sweep.check_overrides(overrides, multirun=multirun)
+        train()
+    except UserError as error:
+        print(f"memcomp-train: {error}", file=sys.stderr)
+        sys.exit(USAGE_ERROR)
+    except KeyboardInterrupt:
+        print(f"\nmemcomp-train: interrupted. {_how_to_go_on()}", file=sys.stderr)
+        sys.exit(130)
+    if (folder := sweep.RememberSweepFolder.folder) is not None:
+        table, n_failed = sweep.merge(folder)
+        print(f"\n{table}\n{closing_lines(_short(folder))}", flush=True)
+        sys.exit(1 if n_failed else 0)
+
+
+def _how_to_go_on() -> str:
+    if (folder := sweep.RememberSweepFolder.folder) is not None:
+        return f"Go on with the same command and hydra.sweep.dir={_short(folder)}"
+    if HydraConfig.initialized():
+        return f"Go on with: memcomp-train resume={_short(Path(HydraConfig.get().runtime.output_dir))}"
+    return ""
+
+
+if __name__ == "__main__":
+    main()
