@@ -35,10 +35,14 @@ def iteration_of(module: pl.LightningModule) -> int:
 
 
 def log_scalars(module: pl.LightningModule, values: Mapping[str, Tensor | float]) -> None:
-    """Log means over replicas at the end of an epoch, by the process of rank 0 alone."""
+    """Log means over replicas and processes at the end of an epoch."""
     prefix = prefix_of(module)
-    means = {f"{prefix}/{name}": torch.as_tensor(value).float().mean() for name, value in values.items()}
-    module.log_dict(means, on_step=False, on_epoch=True, rank_zero_only=True, batch_size=1)
+    means = {
+        f"{prefix}/{name}": torch.as_tensor(value, dtype=torch.float32, device=module.device).mean()
+        for name, value in values.items()
+    }
+    distributed = module.trainer.world_size > 1
+    module.log_dict(means, on_step=False, on_epoch=True, sync_dist=distributed, batch_size=1)
 
 
 def tensorboards(trainer: pl.Trainer) -> list[Any]:

@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import lightning.pytorch as pl
 import torch
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -13,7 +14,7 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, DBNClassifier, DBNPretraining, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import load_weights
@@ -21,11 +22,11 @@ from memcomp_lightning.modules.weights import load_weights
 
 @dataclass(frozen=True)
 class Stage:
-    """One fit: a module, its data, and the configuration of its callbacks."""
+    """One fit: a module, its data and its callbacks."""
 
     module: StageModule
     data: ImageDataModule
-    callbacks: DictConfig
+    callbacks: list[pl.Callback]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,17 @@ class Plan:
         return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
 
 
+_STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
+_SETTINGS = {
+    "": ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks", "seed"),
+    "data": ("source", "partitions", "validation_fraction", "chunk_size"),
+    "pretrain": _STAGE_SETTINGS,
+    "finetune": _STAGE_SETTINGS,
+    "callbacks": ("pretrain", "finetune"),
+}
+"""What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
+
+
 def build(config: DictConfig) -> Plan:
     """Build the objects of a run.
 
@@ -55,6 +67,9 @@ def build(config: DictConfig) -> Plan:
         UserError, SettingError, InstantiationException: A setting does not exist, has the wrong type or is
             out of range; data or weights cannot be read.
     """
+    for group, known in _SETTINGS.items():
+        for name in config if group == "" else config[group]:
+            require_choice(f"setting {group}".rstrip(), name, known)
     seed = config.seed
     require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
     images = _load(instantiate(config.data.source))
@@ -72,7 +87,7 @@ def build(config: DictConfig) -> Plan:
                 seed=seed,
             ),
             _data(config, "pretrain", images),
-            config.callbacks.pretrain,
+            _callbacks(config, "pretrain"),
         )
     if config.finetune.iterations > 0:
         settings: dict[str, Any] = {
@@ -88,7 +103,7 @@ def build(config: DictConfig) -> Plan:
             )
         else:
             classifier = Classifier(network, **settings)
-        finetuning = Stage(classifier, _data(config, "finetune", images), config.callbacks.finetune)
+        finetuning = Stage(classifier, _data(config, "finetune", images), _callbacks(config, "finetune"))
     plan = Plan(network, pretraining, finetuning)
     require(
         bool(plan.stages),
@@ -145,6 +160,10 @@ def _optimizer(config: DictConfig, stage: str) -> OptimizerFactory:
     except (TypeError, ValueError) as error:
         raise UserError(f"{stage}.optimizer: {error}") from error
     return factory
+
+
+def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
+    return [instantiate(callback) for callback in config.callbacks[stage].values() if callback is not None]
 
 
 @cache

@@ -2,7 +2,7 @@
 
 import difflib
 
-from hydra.errors import ConfigCompositionException, HydraException, InstantiationException
+from hydra.errors import HydraException, InstantiationException
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -32,27 +32,29 @@ def explain(error: BaseException) -> str:
             cause = cause.__cause__
         text = str(cause) if cause is not None else str(error).splitlines()[0]
         return f"{setting}: {text}" if setting else text
-    if isinstance(error, ConfigCompositionException) and error.__cause__ is not None:
-        return f"{error} {error.__cause__}".replace("\n", " ")
+    if isinstance(error, HydraException):
+        text, _, _ = str(error).partition("\nConfig search path:")
+        reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]
+        return " ".join([*text.split(), reason]).rstrip()
     return str(error)
 
 
 def unknown_setting(override: str, defaults: DictConfig) -> str | None:
-    """Return a message if an override names a setting that does not exist, with what is close to it.
+    """Return a message if an override names a setting ``group.name`` that does not exist, with what is close.
 
     Args:
         override: As typed: ``pretrain.iteration=20``.
         defaults: A composed configuration of the same groups.
     """
     name, _, value = override.partition("=")
-    if not name or name[0] in "+~" or "@" in name or name.startswith("hydra"):
-        return None
     parent, _, leaf = name.rpartition(".")
-    node = OmegaConf.select(defaults, parent) if parent else defaults
+    if not parent or name[0] in "+~" or "@" in name or name.startswith("hydra."):
+        return None
+    node = OmegaConf.select(defaults, parent)
     if isinstance(node, DictConfig):
         if leaf in node:
             return None
-        known = sorted(f"{parent}.{key!s}" if parent else str(key) for key in node)
+        known = sorted(f"{parent}.{key!s}" for key in node)
     else:
         known = sorted(str(key) for key in defaults)
     close = difflib.get_close_matches(name, known, n=1)

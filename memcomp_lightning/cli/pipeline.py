@@ -59,7 +59,7 @@ def make_trainer(
     """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group."""
     settings = OmegaConf.to_container(config.trainer, resolve=True)
     assert isinstance(settings, dict)
-    settings.pop("checkpoint_every")
+    require_count("trainer.checkpoint_every", settings.pop("checkpoint_every"))
     trainer: pl.Trainer = instantiate(
         settings,
         _convert_="all",
@@ -74,7 +74,6 @@ def make_trainer(
 
 
 def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
-    require_count("trainer.checkpoint_every", config.trainer.checkpoint_every)
     path = folder.checkpoint(stage.module.stage)
     keep_last = ModelCheckpoint(
         dirpath=path.parent,
@@ -83,9 +82,8 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
         save_on_train_epoch_end=True,
         enable_version_counter=False,
     )
-    callbacks = [instantiate(callback) for callback in stage.callbacks.values() if callback is not None]
     trainer = make_trainer(
-        config, max_epochs=stage.module.n_epochs, callbacks=[*callbacks, keep_last], loggers=loggers
+        config, max_epochs=stage.module.n_epochs, callbacks=[*stage.callbacks, keep_last], loggers=loggers
     )
     resume_from = None
     if path.exists():

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
+from memcomp_lightning.cli.pipeline import make_trainer
 from memcomp_lightning.cli.run_folder import RunFolder, write_text
 from memcomp_lightning.cli.table import aligned, mean_and_error, with_error
 
@@ -37,6 +39,7 @@ def check_overrides(overrides: Sequence[str], *, multirun: bool) -> None:
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
     """
+    _check_writable(overrides, multirun=multirun)
     with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
         try:
             jobs = _jobs(overrides) if multirun else [list(overrides)]
@@ -48,10 +51,28 @@ def check_overrides(overrides: Sequence[str], *, multirun: bool) -> None:
                 raise UserError(message)
         for job in jobs:
             try:
-                build(compose("config", job))
+                config = compose("config", job)
+                build(config)
+                make_trainer(config, max_epochs=1, callbacks=[], loggers=[])
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
+
+
+def _check_writable(overrides: Sequence[str], *, multirun: bool) -> None:
+    """Raise unless a file can be made where the run folder will be."""
+    key, default = ("hydra.sweep.dir", "multirun") if multirun else ("hydra.run.dir", "runs")
+    given = dict(override.split("=", 1) for override in overrides if override.startswith(f"{key}="))
+    folder = Path(given.get(key, default).strip("'\"")).absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{key} = {folder} is not allowed: no file can be written in {existing} ({error.strerror}). Choose "
+            f"another folder with {key}=PATH."
+        ) from error
 
 
 def _jobs(overrides: Sequence[str]) -> list[list[str]]:

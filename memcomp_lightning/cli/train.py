@@ -4,6 +4,7 @@ import logging
 import os
 import sys
 import traceback
+import warnings
 from pathlib import Path
 
 import hydra
@@ -27,14 +28,14 @@ log = logging.getLogger(__name__)
 @hydra.main(config_path=f"pkg://{sweep.CONFIG_MODULE}", config_name="config", version_base="1.3")
 def train(config: DictConfig) -> None:
     """One run, or one job of a sweep."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    _silence_lightning()  # again: a job of a parallel launcher is in a process of its own
     settings = HydraConfig.get()
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
         _train(config, folder, _overrides(settings.overrides.task))
-    except (Exception, SystemExit) as error:
-        if not in_sweep or isinstance(error, SystemExit):
+    except Exception as error:
+        if not in_sweep:
             raise
         folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
         log.error("Failed, the sweep goes on: %s", explain(error))
@@ -48,8 +49,8 @@ def _train(config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> 
     if result is None:
         try:
             result = pipeline.run(plan, config, folder, overrides)
-        except SystemExit as stop:
-            raise KeyboardInterrupt from stop
+        except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
+            raise KeyboardInterrupt(f"Go on with: memcomp-train resume={_short(folder.path)}") from stop
     else:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
@@ -89,6 +90,7 @@ def _resumed(arguments: list[str]) -> list[str]:
 
 def main() -> None:
     """Entry point: check everything, train, and end with a table or a message."""
+    _silence_lightning()
     try:
         sys.argv[1:] = _resumed(sys.argv[1:])
         flags = {argument for argument in sys.argv[1:] if argument.startswith("-")}
@@ -105,8 +107,11 @@ def main() -> None:
     except UserError as error:
         print(f"memcomp-train: {error}", file=sys.stderr)
         sys.exit(USAGE_ERROR)
-    except KeyboardInterrupt:
-        print(f"\nmemcomp-train: interrupted. {_how_to_go_on()}", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        how = str(interrupt)
+        if sweep.RememberSweepFolder.folder is not None:
+            how = f"Go on with the same command and hydra.sweep.dir={_short(sweep.RememberSweepFolder.folder)}"
+        print(f"\nmemcomp-train: interrupted. {how}".rstrip(), file=sys.stderr)
         sys.exit(130)
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
@@ -114,12 +119,10 @@ def main() -> None:
         sys.exit(1 if n_failed else 0)
 
 
-def _how_to_go_on() -> str:
-    if (folder := sweep.RememberSweepFolder.folder) is not None:
-        return f"Go on with the same command and hydra.sweep.dir={_short(folder)}"
-    if HydraConfig.initialized():
-        return f"Go on with: memcomp-train resume={_short(Path(HydraConfig.get().runtime.output_dir))}"
-    return ""
+def _silence_lightning() -> None:
+    """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
 
 
 if __name__ == "__main__":

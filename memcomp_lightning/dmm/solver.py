@@ -45,7 +45,7 @@ class DmmSolver:
     integrator: Integrator = dataclasses.field(default_factory=AdaptiveEuler)
     n_restarts: int = 28
     patience: int | None = None
-    max_steps: int = 630
+    max_steps: int = 300
     record: Recording | None = None
 
     def __post_init__(self) -> None:
@@ -60,8 +60,9 @@ class DmmSolver:
                 f"an integer from 1 to n_restarts = {self.n_restarts}, or null",
             )
         if self.record is not None:
+            require_count("record.every", self.record.every)
             require(
-                1 <= self.record.every <= self.max_steps,
+                self.record.every <= self.max_steps,
                 "record.every",
                 self.record.every,
                 f"an integer from 1 to max_steps = {self.max_steps}",

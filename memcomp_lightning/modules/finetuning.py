@@ -1,6 +1,9 @@
 """Fine-tuning: a DBN becomes a classifier."""
 
+from collections.abc import Iterable
+
 from torch import Generator, nn
+from torch.nn import Parameter
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, Initialiser, Linear
@@ -38,3 +41,8 @@ class DBNClassifier(Classifier):
         )
         network = nn.Sequential(dbn, output.to(dbn[0].weight))
         super().__init__(network, iterations=iterations, optimizer=optimizer, seed=seed)
+        self.dbn = dbn
+
+    def parameters_at_rest(self) -> Iterable[Parameter]:
+        """The visible biases: a feed-forward pass does not use them."""
+        return (rbm.b for rbm in self.dbn)

@@ -1,9 +1,11 @@
 """Greedy pretraining of a deep belief network, one RBM after the other."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from memcomp_lightning import rng
@@ -57,6 +59,7 @@ class DBNPretraining(StageModule):
         self.energy_gaps: list[Tensor] = []
         self._sampler_state: Any = None
         self._negative: NegativePhase[Any] | None = None
+        self._gap: Tensor | float = 0.0
 
     @property
     def n_epochs(self) -> int:
@@ -124,10 +127,11 @@ class DBNPretraining(StageModule):
         negative = self._negative
         gap = contrast(rbm, positive, negative.configurations)
         loss = batch.share * gap.sum()
-        self.update(loss + self._untouched_parameters(), closes_step=batch.closes_step, optimizer_index=self.layer)
-        self.energy_gaps[self.layer] = gap.detach()
+        self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
+        self._gap = self._gap + batch.share * gap.detach()
         if batch.closes_step:
-            self._negative = None
+            self.energy_gaps[self.layer] = self._mean_over_processes(self._gap)
+            self._negative, self._gap = None, 0.0
         return {
             "loss": loss.detach(),
             "contrast": gap.detach(),
@@ -156,15 +160,15 @@ class DBNPretraining(StageModule):
         self._sampler_state = negative.state
         return negative
 
-    def _untouched_parameters(self) -> Tensor | float:
-        """Zero, but depending on the layers at rest: distributed training waits for every gradient.
-
-        Only the active layer's optimiser steps, so their zero gradients change nothing.
-        """
+    def _mean_over_processes(self, value: Tensor | float) -> Tensor:
+        value = torch.as_tensor(value)
         if self.trainer.world_size == 1:
-            return 0.0
-        at_rest = [rbm for layer, rbm in enumerate(self.dbn) if layer != self.layer]
-        return 0.0 * sum((p.sum() for rbm in at_rest for p in rbm.parameters()), torch.zeros(()).to(self.device))
+            return value
+        return cast(Tensor, self.trainer.strategy.reduce(value, reduce_op="mean"))
+
+    def parameters_at_rest(self) -> Iterable[Parameter]:
+        """Those of the other layers."""
+        return (p for layer, rbm in enumerate(self.dbn) if layer != self.layer for p in rbm.parameters())
 
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains and the energy gaps."""

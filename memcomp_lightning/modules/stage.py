@@ -84,12 +84,23 @@ class StageModule(pl.LightningModule):
 
     def update(self, loss: Tensor, *, closes_step: bool, optimizer_index: int = 0) -> None:
         """Add the gradient of ``loss``; step and clear once the step's last chunk is in."""
-        self.manual_backward(loss)
+        if self.trainer.world_size > 1:
+            # Distributed training waits for the gradient of every parameter: those at rest give a zero.
+            at_rest = list(self.parameters_at_rest())
+            self.manual_backward(loss + sum(0.0 * parameter.sum() for parameter in at_rest))
+            for parameter in at_rest:
+                parameter.grad = None
+        else:
+            self.manual_backward(loss)
         if closes_step:
             optimizers = self.optimizers()
             optimizer = optimizers[optimizer_index] if isinstance(optimizers, list) else optimizers
             optimizer.step()
             optimizer.zero_grad()
+
+    def parameters_at_rest(self) -> Iterable[Parameter]:
+        """Parameters that the present loss does not depend on."""
+        return ()
 
     def extra_state(self) -> dict[str, Any]:
         """State of this process that a checkpoint must hold beside weights and streams: tensors in dicts."""

@@ -1,5 +1,6 @@
 """The conformance kit: what every sampler and every solver must do, whatever its method."""
 
+import dataclasses
 from typing import Any
 
 import torch
@@ -35,6 +36,7 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
         AssertionError: Naming what the sampler got wrong.
     """
     name = type(sampler).__name__
+    _check_frozen(sampler)
     for replicas in ((), (3,), (2, 3)):
         rbm = small_rbm(replicas=replicas)
         before = [parameter.detach().clone() for parameter in rbm.parameters()]
@@ -70,6 +72,19 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
         for key, value in answers[0].info.items():
             _check(not value.requires_grad, f"{name}: info[{key!r}] carries a gradient")
             _check(tuple(value.shape) in ((), replicas), f"{name}: info[{key!r}] has shape {tuple(value.shape)}")
+
+
+def _check_frozen(sampler: object) -> None:
+    if dataclasses.is_dataclass(sampler):
+        settings = [field.name for field in dataclasses.fields(sampler)]
+    else:
+        settings = list(getattr(sampler, "__dict__", {}))
+    for setting in settings:
+        try:
+            setattr(sampler, setting, getattr(sampler, setting))
+        except AttributeError:
+            continue
+        _check(False, f"{type(sampler).__name__}: the setting {setting!r} can be changed; freeze the class")
 
 
 def _check_configurations(name: str, configurations: Configurations, rbm: RBM) -> None:

@@ -31,6 +31,8 @@ def chi_square_p_value(counts: Tensor, probabilities: Tensor, *, min_expected: f
         min_expected: States expected less often than this are counted as one.
     """
     expected = probabilities.double() * counts.sum()
+    if bool((counts[expected == 0] > 0).any()):
+        return 0.0  # A state that cannot occur did.
     rare = expected < min_expected
     observed_bins, expected_bins = counts[~rare].double(), expected[~rare]
     if bool(rare.any()) and float(expected[rare].sum()) > 0:

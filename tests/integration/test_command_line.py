@@ -1,0 +1,166 @@
+"""What a user types works, and what cannot work is refused before training."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import FAST, Outcome
+
+import memcomp_lightning
+
+Run = Callable[..., Outcome]
+CONF = Path(memcomp_lightning.__file__).parent / "conf"
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("sampler", [name for name in options("sampler") if name != "exact"])
+def test_every_sampler_trains(memcomp_train: Run, sampler: str) -> None:
+    outcome = memcomp_train(f"sampler={sampler}", *FAST, "solver.n_restarts=3", "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert "pretrain layer 2" in outcome.out
+    assert "tensorboard --logdir run" in outcome.out
+    result = json.loads(Path("run/result.json").read_text())
+    assert len(result["stages"]["pretrain"]["energy_gap"]) == 2
+    assert 0 <= result["test_accuracy"][0] <= 1
+
+
+def test_exact_sampler_trains_a_small_model(memcomp_train: Run) -> None:
+    outcome = memcomp_train(
+        "sampler=exact", "data=shifting_bars", "model.hidden_sizes=[7]", "finetune.batch_size=9", *FAST
+    )
+    assert outcome.status == 0, outcome.err
+
+
+@pytest.mark.parametrize("experiment", options("experiment"))
+def test_every_experiment_runs_fast(memcomp_train: Run, experiment: str) -> None:
+    outcome = memcomp_train(f"experiment={experiment}", "trainer.fast_dev_run=true", "solver.max_steps=20")
+    assert outcome.status == 0, outcome.err
+
+
+@pytest.mark.parametrize("logger", options("logger"))
+@pytest.mark.parametrize("callbacks", options("callbacks"))
+def test_every_logger_and_set_of_callbacks(memcomp_train: Run, logger: str, callbacks: str) -> None:
+    outcome = memcomp_train(f"logger={logger}", f"callbacks={callbacks}", "sampler=cd", *FAST, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert Path("run/csv/version_0/metrics.csv").exists() == (logger in ("csv", "both"))
+    assert any(Path("run").glob("events.out.*")) == (logger in ("tensorboard", "both"))
+
+
+def test_baseline_and_partitions_report_mean_and_error(memcomp_train: Run) -> None:
+    outcome = memcomp_train("model=baseline_bn_relu", "data.partitions=3", *FAST, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert "pretrain" not in outcome.out
+    assert "±" in outcome.out
+    assert len(json.loads(Path("run/result.json").read_text())["test_accuracy"]) == 3
+
+
+def test_help_names_groups_and_examples(memcomp_train: Run) -> None:
+    outcome = memcomp_train("--help")
+    assert outcome.status == 0
+    assert "sampler: cd, dmm_qubo" in outcome.out
+    assert "resume=RUN_FOLDER" in outcome.out
+
+
+REFUSED = {
+    "pretrain.iteration=3": ["pretrain.iteration=3", "does not exist", "Did you mean pretrain.iterations?"],
+    "sead=3": ["'sead'"],
+    "sampler=foo": ["sampler/foo", "cd dmm_qubo"],
+    "pretrain.iterations=-1": ["pretrain.iterations = -1", "an integer >= 0"],
+    "pretrain.iterations=abc": ["pretrain.iterations = 'abc'", "an integer >= 0"],
+    "finetune.iterations=1.5": ["finetune.iterations = 1.5", "an integer >= 0"],
+    "solver.n_restarts=0": ["n_restarts = 0", "an integer >= 1"],
+    "solver.patience=99": ["patience = 99", "1 to n_restarts = 28"],
+    "solver.field.gamma=2": ["gamma = 2", "(0, 1/2)"],
+    "pretrain.optimizer.lr=-1": ["pretrain.optimizer", "-1"],
+    "finetune.batch_size=5000": ["batch_size = 5000", "1437 training images"],
+    "data.partitions=0": ["data.partitions = 0", "an integer >= 1"],
+    "seed=1.5": ["seed = 1.5", "an integer"],
+    "model.hidden_sizes=[0]": ["n_hidden = 0", "an integer >= 1"],
+    "model.weights=none.pt": ["none.pt does not exist"],
+    "sampler=exact": ["32 is not allowed", "max_units = 16"],
+    "trainer.devices=0": ["devices=0"],
+    "trainer.checkpoint_every=0": ["trainer.checkpoint_every = 0", "an integer >= 1"],
+    "hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
+    "callbacks.pretrain.momentum_schedule.initial=2": ["momentum initial = 2", "[0, 1)"],
+    "+keep=1": ["setting = 'keep'", "'pretrain'"],
+    "+pretrain.lr=1": ["setting pretrain = 'lr'", "'optimizer'"],
+    "resume=nowhere": ["resume=nowhere", "overrides.yaml"],
+}
+
+
+@pytest.mark.parametrize("override", REFUSED)
+def test_refused_before_training(memcomp_train: Run, override: str) -> None:
+    outcome = memcomp_train(override)
+    assert outcome.status == 2
+    assert outcome.err.startswith("memcomp-train: ")
+    assert "Traceback" not in outcome.err
+    for part in REFUSED[override]:
+        assert part in outcome.err
+    assert not list(Path.cwd().rglob("*")), "a refused run leaves nothing behind"
+
+
+def test_missing_mnist_says_what_where_and_how(memcomp_train: Run) -> None:
+    outcome = memcomp_train("data=mnist", "data.source.data_dir=/nowhere", "data.source.download=false")
+    assert outcome.status == 2
+    for part in ("/nowhere/MNIST/raw/train-images-idx3-ubyte", "MEMCOMP_DATA_DIR", "data=digits"):
+        assert part in outcome.err
+
+
+def test_folder_of_other_settings_is_refused(memcomp_train: Run) -> None:
+    assert memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run").status == 0
+    outcome = memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run", "pretrain.iterations=3")
+    assert outcome.status != 0
+    assert "pretrain.iterations=2, not 3" in outcome.err
+
+
+def test_finished_run_is_not_repeated(memcomp_train: Run) -> None:
+    arguments = ("sampler=cd", *FAST, "hydra.run.dir=run")
+    first = memcomp_train(*arguments)
+    written = Path("run/result.json").stat().st_mtime_ns
+    again = memcomp_train(*arguments)
+    assert again.status == 0
+    assert Path("run/result.json").stat().st_mtime_ns == written
+    assert first.out.splitlines()[-6:] == again.out.splitlines()[-6:]
+
+
+def test_weights_of_another_shape_and_damaged_weights_are_refused(memcomp_train: Run) -> None:
+    assert memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run").status == 0
+    weights = Path("run/weights/pretrain.pt")
+    outcome = memcomp_train(f"model.weights={weights}", "model.hidden_sizes=[7,5]")
+    assert outcome.status == 2
+    assert "rbms.0.b has shape (32,)" in outcome.err or "shape (32, 32)" in outcome.err
+    damaged = Path("damaged.pt")
+    damaged.write_bytes(weights.read_bytes()[:500])
+    outcome = memcomp_train(f"model.weights={damaged}")
+    assert outcome.status == 2
+    assert "truncated" in outcome.err or "damaged" in outcome.err
+
+
+def test_code_in_weights_is_not_executed(memcomp_train: Run, tmp_path: Path) -> None:
+    class Attack:
+        def __reduce__(self) -> tuple[object, tuple[str]]:
+            return (Path.touch, (tmp_path / "executed",))
+
+    torch.save({"weight": Attack()}, "attack.pt")
+    outcome = memcomp_train("model.weights=attack.pt")
+    assert outcome.status == 2
+    assert "never executed" in outcome.err
+    assert not Path("executed").exists()
+
+
+def test_pretrained_weights_start_another_run(memcomp_train: Run) -> None:
+    assert memcomp_train("sampler=cd", *FAST, "hydra.run.dir=first").status == 0
+    outcome = memcomp_train(
+        "model.weights=first/weights/pretrain.pt",
+        "pretrain.iterations=0",
+        "finetune.iterations=2",
+        "hydra.run.dir=second",
+    )
+    assert outcome.status == 0, outcome.err
+    results = [json.loads(Path(name, "result.json").read_text()) for name in ("first", "second")]
+    assert results[0]["test_loss"] == results[1]["test_loss"]

@@ -1,0 +1,85 @@
+"""Two real processes do the full-batch update of one."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+Start = Callable[..., "subprocess.Popen[str]"]
+RUN = [
+    "sampler=ground_state",
+    "solver=alternating_descent",
+    "pretrain.iterations=4",
+    "finetune.iterations=3",
+    "finetune.batch_size=null",
+    "finetune.optimizer.lr=1.0",
+]
+
+
+def test_two_processes_give_the_update_of_one(start_process: Start, tmp_path: Path) -> None:
+    one = start_process(*RUN, "hydra.run.dir=one")
+    _, err = one.communicate()
+    assert one.returncode == 0, err
+    two = start_process(*RUN, "hydra.run.dir=two", "trainer.devices=2", "trainer.strategy=ddp")
+    out, err = two.communicate(timeout=200)
+    assert two.returncode == 0, err
+    for stage in ("pretrain", "finetune"):
+        expected = torch.load(tmp_path / "one/weights" / f"{stage}.pt", weights_only=True)
+        found = torch.load(tmp_path / "two/weights" / f"{stage}.pt", weights_only=True)
+        for name, tensor in expected.items():
+            torch.testing.assert_close(found[name], tensor, rtol=1e-5, atol=1e-6)
+    gaps = [
+        json.loads((tmp_path / name / "result.json").read_text())["stages"]["pretrain"]["energy_gap"]
+        for name in ("one", "two")
+    ]
+    assert torch.tensor(gaps[0]) == pytest.approx(torch.tensor(gaps[1]), rel=1e-4)
+    assert out.count("test accuracy") == 1, "the table is printed once"
+
+
+def test_chains_and_streams_differ_between_processes_and_resume(tmp_path: Path) -> None:
+    script = tmp_path / "chains.py"
+    script.write_text(
+        """
+import lightning.pytorch as pl, torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from memcomp_lightning.data import Digits, ImageDataModule
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.samplers import PCD
+
+def fit(epochs, resume=None):
+    module = DBNPretraining(DBN(32, [5]), PCD(n_chains=7), iterations=4)
+    keep = ModelCheckpoint("ckpt", filename=f"to{epochs}", save_on_train_epoch_end=True)
+    trainer = pl.Trainer(max_epochs=epochs, devices=2, strategy="ddp", accelerator="cpu", logger=False,
+                         callbacks=[keep], enable_progress_bar=False, enable_model_summary=False)
+    data = ImageDataModule(Digits().load(), batch_size=100)
+    trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    return module, trainer
+
+fit(2)
+whole, _ = fit(4)
+resumed, trainer = fit(4, "ckpt/to2.ckpt")
+if trainer.is_global_zero:
+    same = all(a.equal(b) for a, b in zip(whole.parameters(), resumed.parameters()))
+    states = torch.load("ckpt/to2.ckpt", weights_only=True)["process_states"]
+    chains = [state["extra"]["sampler"]["v"] for state in states]
+    streams = [state["streams"]["negative_phase"] for state in states]
+    print("resumed to the same bits:", same, "own chains:", not chains[0].equal(chains[1]),
+          "own streams:", not streams[0].equal(streams[1]))
+"""
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "resumed to the same bits: True own chains: True own streams: True" in done.stdout

@@ -1,0 +1,91 @@
+"""A multirun: one table, failures listed, finished jobs not repeated."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import FAST, Outcome
+
+from memcomp_lightning.cli import pipeline
+
+Run = Callable[..., Outcome]
+SWEEP = ["-m", "sampler=cd,pcd", "seed=0,1,2", *FAST, "hydra.sweep.dir=sweep"]
+
+
+def rows(path: str) -> list[dict[str, str]]:
+    with Path(path).open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_table_has_mean_and_error_over_seeds_and_replicas(memcomp_train: Run) -> None:
+    outcome = memcomp_train(*SWEEP, "data.partitions=2")
+    assert outcome.status == 0, outcome.err
+    table = rows("sweep/table.csv")
+    assert [row["sampler"] for row in table] == ["cd", "pcd"]
+    assert all((row["n_runs"], row["n_values"]) == ("3", "6") for row in table)
+    results = [json.loads(path.read_text()) for path in Path("sweep").glob("*sampler=cd*/result.json")]
+    accuracies = [accuracy for result in results for accuracy in result["test_accuracy"]]
+    assert float(table[0]["test_accuracy_mean"]) == pytest.approx(sum(accuracies) / 6)
+    assert outcome.out.count("3 x 2") == 2
+    assert "finetune.iterations" not in outcome.out.splitlines()[-6]
+
+
+def test_failing_job_leaves_the_others_and_is_repeated_alone(
+    memcomp_train: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[str] = []
+    original = pipeline.run
+
+    def sometimes(plan: object, config: object, folder: object, overrides: dict[str, str]) -> dict[str, object]:
+        trained.append(overrides["seed"])
+        if broken and overrides["seed"] == "1" and overrides["sampler"] == "cd":
+            raise RuntimeError("the disk caught fire")
+        return original(plan, config, folder, overrides)
+
+    monkeypatch.setattr(pipeline, "run", sometimes)
+    broken = True
+    outcome = memcomp_train(*SWEEP)
+    assert outcome.status == 1
+    assert "1 failed" in outcome.out
+    assert "RuntimeError: the disk caught fire" in outcome.out
+    assert [row["n_runs"] for row in rows("sweep/table.csv")] == ["2", "3"]
+    broken = False
+    trained.clear()
+    assert memcomp_train(*SWEEP).status == 0
+    assert trained == ["1"]
+    assert [row["n_runs"] for row in rows("sweep/table.csv")] == ["3", "3"]
+
+
+def test_all_jobs_are_checked_before_the_first_trains(memcomp_train: Run) -> None:
+    outcome = memcomp_train("-m", "sampler=cd,pcd", "pretrain.iterations=2,-1", "hydra.sweep.dir=sweep")
+    assert outcome.status == 2
+    assert "pretrain.iterations = -1 is not allowed" in outcome.err
+    assert "job sampler=cd pretrain.iterations=-1" in outcome.err
+    assert not Path("sweep").exists()
+
+
+def test_batch_size_and_model_can_be_swept(memcomp_train: Run) -> None:
+    outcome = memcomp_train(
+        "-m", "pretrain.batch_size=null,100", "model=dbn,baseline_bn_relu", "sampler=cd", *FAST
+    )
+    assert outcome.status == 0, outcome.err
+    table = rows(next(str(path) for path in Path("multirun").rglob("table.csv")))
+    assert sorted((row["pretrain.batch_size"], row["model"]) for row in table) == [
+        ("100", "baseline_bn_relu"),
+        ("100", "dbn"),
+        ("null", "baseline_bn_relu"),
+        ("null", "dbn"),
+    ]
+
+
+def test_joblib_launcher_gives_the_same_results(memcomp_train: Run) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    assert memcomp_train(*SWEEP).status == 0
+    parallel = [argument if "sweep.dir" not in argument else "hydra.sweep.dir=parallel" for argument in SWEEP]
+    outcome = memcomp_train(*parallel, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    assert outcome.status == 0, outcome.err
+    for row, other in zip(rows("sweep/table.csv"), rows("parallel/table.csv"), strict=True):
+        assert row["test_accuracy_mean"] == other["test_accuracy_mean"]
+        assert row["energy_gap_mean"] == other["energy_gap_mean"]
