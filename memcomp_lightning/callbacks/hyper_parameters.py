@@ -31,7 +31,8 @@ class HyperParameters(pl.Callback):
 
     Args:
         settings: Nested settings, plain values.
-        metrics: Names of logged metrics to show beside them; those that were not logged are left out.
+        metrics: Names of logged metrics to show beside them as ``final/<name>``; those that were not logged are
+            left out.
     """
 
     def __init__(self, settings: Mapping[str, Any], metrics: Sequence[str]) -> None:
@@ -42,5 +43,5 @@ class HyperParameters(pl.Callback):
         """Log both."""
         if trainer.is_global_zero:
             logged = trainer.callback_metrics
-            final = {name: float(logged[name]) for name in self.metrics if name in logged}
+            final = {f"final/{name}": float(logged[name]) for name in self.metrics if name in logged}
             write_hyper_parameters(trainer.loggers, self.settings, final)

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, required, tensorboards
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, prefix_of, required, tensorboards
 
 
 class NegativePhaseEnergies(EveryIterations):
@@ -37,4 +37,4 @@ class NegativePhaseEnergies(EveryIterations):
         )
         for board in tensorboards(trainer):
             for name, values in (("energies_data", data_energies), ("energies_model", energies)):
-                board.add_histogram(f"{pl_module.log_prefix}/{name}", values.flatten(), trainer.global_step)
+                board.add_histogram(f"{prefix_of(pl_module)}/{name}", values.flatten(), trainer.global_step)

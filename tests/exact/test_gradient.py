@@ -1,0 +1,82 @@
+"""The gradient of the contrast is the gradient of the enumerated log-likelihood."""
+
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.samplers import CD, Exact
+from memcomp_lightning.testing.conformance import small_rbm
+from memcomp_lightning.types import Configurations
+
+SIZES = [(7, 5), (5, 7)]
+REPLICAS = [(), (3,), (2, 3)]
+
+
+def data(rbm, binary, n=11):
+    v = rng.uniform((*rbm.replicas, n, rbm.n_visible), generator=rng.stream(1, "data")).double()
+    return (v < 0.4).double() if binary else v
+
+
+def negative_log_likelihood(rbm, v):
+    """Mean over the images of ``log Z - log sum_h exp(-E(v, h))``, from energies alone."""
+    n_visible, n_hidden = rbm.n_visible, rbm.n_hidden
+    joint = binary_states(n_visible + n_hidden, like=v)
+    weight, b, c = rbm.weight, rbm.b, rbm.c
+    x, h = joint[:, :n_visible], joint[:, n_visible:]
+    energy = -torch.einsum("...ij,si,sj->...s", weight, h, x) - b @ x.T - c @ h.T
+    log_z = torch.logsumexp(-energy, -1)
+    hidden = binary_states(n_hidden, like=v)
+    clamped = torch.einsum("...ij,si,...nj->...ns", weight, hidden, v)
+    clamped = clamped + (v @ b.unsqueeze(-1)) + (c @ hidden.T).unsqueeze(-2)
+    return log_z - torch.logsumexp(clamped, -1).mean(-1)
+
+
+def gradients(rbm, sampler, v):
+    state = sampler.init(rbm, v.shape[-2], generator=rng.stream(0, "negative_phase"))
+    negative = sampler.sample(rbm, state, v, generator=rng.stream(0, "negative_phase"))
+    positive = Configurations(v, rbm.hidden_mean(v))
+    ours = torch.autograd.grad(contrast(rbm, positive, negative.configurations).sum(), list(rbm.parameters()))
+    true = torch.autograd.grad(negative_log_likelihood(rbm, v).sum(), list(rbm.parameters()))
+    return ours, true
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+@pytest.mark.parametrize("replicas", REPLICAS, ids=str)
+@pytest.mark.parametrize("binary", [True, False], ids=["binary", "real-valued"])
+def test_contrast_with_exact_negative_phase_is_the_likelihood_gradient(sizes, replicas, binary):
+    rbm = small_rbm(*sizes, replicas=replicas).double()
+    for ours, true in zip(*gradients(rbm, Exact(), data(rbm, binary)), strict=True):
+        assert true.abs().min() > 1e-6
+        torch.testing.assert_close(ours, true, rtol=0, atol=1e-13)
+
+
+def test_contrast_with_one_sweep_is_not_the_likelihood_gradient():
+    rbm = small_rbm().double()
+    ours, true = gradients(rbm, CD(k=1), data(rbm, binary=True))
+    assert (ours[0] - true[0]).abs().max() > 1e-3
+
+
+def test_contrast_changes_by_the_likelihood_ratio_to_first_order():
+    rbm = small_rbm().double()
+    v = data(rbm, binary=True)
+    ours, _ = gradients(rbm, Exact(), v)
+    before = negative_log_likelihood(rbm, v)
+    step = 1e-6
+    with torch.no_grad():
+        for parameter, gradient in zip(rbm.parameters(), ours, strict=True):
+            parameter -= step * gradient
+    fall = sum(gradient.square().sum() for gradient in ours) * step
+    torch.testing.assert_close(before - negative_log_likelihood(rbm, v), fall, rtol=1e-4, atol=0)
+
+
+def test_replicas_stay_independent():
+    rbm = small_rbm(replicas=(3,)).double()
+    v = data(rbm, binary=True)
+    ours, _ = gradients(rbm, Exact(), v)
+    v[2] = 1 - v[2]
+    other, _ = gradients(rbm, Exact(), v)
+    for a, b in zip(ours, other, strict=True):
+        assert a[:2].equal(b[:2])
+        assert not a[2].equal(b[2])

@@ -1,0 +1,99 @@
+"""The wheel carries its configuration, and another Hydra project reaches it."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import memcomp_lightning
+
+ROOT = Path(memcomp_lightning.__file__).parents[1]
+
+DOWNSTREAM = """
+import hydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+
+import memcomp_lightning
+
+@hydra.main(config_path="conf", config_name="config", version_base="1.3")
+def main(config: DictConfig) -> None:
+    print(memcomp_lightning.__file__, instantiate(config.sampler).solver.max_steps, config.own_setting)
+
+main()
+"""
+
+
+def run(*command: str, folder: Path, path: Path | None = None) -> str:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), ".", folder=ROOT)
+    return next(folder.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel unpacked in a folder that comes before the checkout on the path."""
+    folder = tmp_path_factory.mktemp("installed")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def test_wheel_holds_every_config_and_the_type_marker(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    expected = {
+        f"memcomp_lightning/conf/{path.relative_to(ROOT / 'conf')}" for path in ROOT.glob("conf/**/*.yaml")
+    }
+    assert expected <= names
+    assert "memcomp_lightning/conf/__init__.py" in names
+    assert "memcomp_lightning/py.typed" in names
+    assert not [name for name in names if name.startswith(("tests", "conf/"))]
+
+
+def test_command_line_from_the_wheel(installed: Path, tmp_path: Path) -> None:
+    out = run(
+        sys.executable,
+        "-c",
+        "import memcomp_lightning as m; from memcomp_lightning.cli.train import main; print(m.__file__); main()",
+        "sampler=cd",
+        "pretrain.iterations=1",
+        "finetune.iterations=1",
+        folder=tmp_path,
+        path=installed,
+    )
+    assert str(installed) in out
+    assert "test accuracy" in out
+
+
+@pytest.mark.parametrize("from_wheel", [True, False], ids=["wheel", "editable"])
+def test_another_project_composes_our_groups(installed: Path, tmp_path: Path, from_wheel: bool) -> None:
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf/config.yaml").write_text(
+        "defaults: [{solver: dmm}, {sampler: dmm_qubo}, _self_]\n"
+        "own_setting: 7\n"
+        "hydra: {searchpath: ['pkg://memcomp_lightning.conf']}\n"
+    )
+    (tmp_path / "project.py").write_text(DOWNSTREAM)
+    out = run(
+        sys.executable,
+        "project.py",
+        "solver.max_steps=77",
+        folder=tmp_path,
+        path=installed if from_wheel else None,
+    )
+    assert out.split()[1:] == ["77", "7"]
+    assert (str(installed) in out) == from_wheel

@@ -1,0 +1,243 @@
+"""Every sampler and solver passes the published kit; broken ones do not."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from memcomp_lightning.dmm import DmmSolver, Recording
+from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo
+from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
+from memcomp_lightning.samplers.gibbs import sweep
+from memcomp_lightning.testing import check_sampler, check_solver
+from memcomp_lightning.types import Configurations, NegativePhase
+
+SOLVERS = {
+    "DMM": DmmSolver(n_restarts=11, max_steps=101),
+    "DMM with patience": DmmSolver(n_restarts=28, patience=11, max_steps=101),
+    "DMM that records": DmmSolver(n_restarts=11, max_steps=101, record=Recording(every=7)),
+    "DMM with both": DmmSolver(n_restarts=28, patience=11, max_steps=101, record=Recording(every=7)),
+    "descent": AlternatingDescent(n_restarts=53),
+    "brute force": BruteForce(),
+    "brute force in chunks": BruteForce(chunk_size=13),
+}
+SAMPLERS = {
+    "CD-1": CD(),
+    "CD-3": CD(k=3),
+    "PCD": PCD(),
+    "PCD with its own chains": PCD(k=3, n_chains=23),
+    "exact": Exact(),
+    "quench": Quench(),
+    "quench, one start an image": Quench(n_chains=None),
+    "time average": GroundState(
+        solver=DmmSolver(n_restarts=5, max_steps=53, record=Recording(every=8)), readout="time_average"
+    ),
+    "time average with patience": GroundState(
+        solver=DmmSolver(n_restarts=11, patience=2, max_steps=53, record=Recording(every=8)),
+        readout="time_average",
+    ),
+} | {f"ground state by {name}": GroundState(solver=solver) for name, solver in SOLVERS.items()}
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
+def test_sampler_keeps_the_contract(sampler):
+    check_sampler(sampler)
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+def test_solver_keeps_the_contract(solver):
+    check_solver(solver)
+
+
+def test_solver_with_too_few_steps_keeps_all_but_the_optimum():
+    hasty = DmmSolver(n_restarts=2, max_steps=1)
+    check_solver(hasty, finds_optimum=False)
+    with pytest.raises(AssertionError, match=r"DmmSolver on .*: minimum not found"):
+        check_solver(hasty)
+
+
+# --- broken samplers --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BrokenSampler(PCD):
+    """A right sampler; what breaks it is one method a subclass."""
+
+
+class ChangesItsState(BrokenSampler):
+    def sample(self, model, state, v_data, *, generator):
+        state.v.copy_(sweep(model, state.v, generator=generator))
+        return NegativePhase(Configurations(state.v, model.hidden_mean(state.v).detach()), state, {})
+
+
+class DrawsFromTheGlobalStream(BrokenSampler):
+    def sample(self, model, state, v_data, *, generator):
+        torch.empty(3).normal_()
+        return PCD.sample(self, model, state, v_data, generator=generator)
+
+
+class DrawsFromTheGlobalStreamAtInit(BrokenSampler):
+    def init(self, model, n_chains, *, generator):
+        torch.empty(3).normal_()
+        return PCD.init(self, model, n_chains, generator=generator)
+
+
+class CarriesAGradient(BrokenSampler):
+    def sample(self, model, state, v_data, *, generator):
+        v = model.visible_mean(model.hidden_mean(state.v))
+        return NegativePhase(Configurations(v, model.hidden_mean(v).detach()), state, {})
+
+
+def wraps(change):
+    """A sampler whose answer is changed by ``change(negative, model)``."""
+
+    class Wrapped(BrokenSampler):
+        def sample(self, model, state, v_data, *, generator):
+            return change(PCD.sample(self, model, state, v_data, generator=generator), model)
+
+    return Wrapped
+
+
+def with_configurations(**changes):
+    def change(negative, model):
+        parts = {name: make(negative.configurations, model) for name, make in changes.items()}
+        return negative._replace(configurations=negative.configurations._replace(**parts))
+
+    return wraps(change)
+
+
+class ChangesTheModel(BrokenSampler):
+    def sample(self, model, state, v_data, *, generator):
+        with torch.no_grad():
+            model.b += 0.1
+        return PCD.sample(self, model, state, v_data, generator=generator)
+
+
+class IgnoresTheStream(BrokenSampler):
+    def sample(self, model, state, v_data, *, generator):
+        generator.manual_seed(CALLS.append(0) or len(CALLS))
+        return PCD.sample(self, model, state, v_data, generator=generator)
+
+
+CALLS = []
+
+BROKEN_SAMPLERS = [
+    (ChangesItsState, "changed the state it was given"),
+    (DrawsFromTheGlobalStream, "drew from torch's global random stream"),
+    (DrawsFromTheGlobalStreamAtInit, "drew from torch's global random stream"),
+    (CarriesAGradient, "v carries a gradient"),
+    (ChangesTheModel, "changed the model"),
+    (IgnoresTheStream, "same stream, other answer"),
+    (with_configurations(v=lambda x, model: 2 * x.v - 1), r"v leaves \[0, 1\]"),
+    (with_configurations(h=lambda x, model: model.hidden_field(x.v).detach()), r"h leaves \[0, 1\]"),
+    (with_configurations(h=lambda x, model: x.h[..., 1:]), "h has shape"),
+    (with_configurations(v=lambda x, model: x.v[..., 1:]), "last axis of v is 6, not 7"),
+    (with_configurations(h=lambda x, model: model.hidden_mean(x.v)), "h carries a gradient"),
+    (with_configurations(weight=lambda x, model: -x.v.sum(-1)), "weights must be finite, >= 0, not all 0"),
+    (with_configurations(weight=lambda x, model: 0 * x.v[..., 0]), "weights must be finite, >= 0, not all 0"),
+    (with_configurations(weight=lambda x, model: x.v), "weight has shape"),
+    (
+        wraps(lambda negative, model: negative._replace(info={"energy": model.weight.sum()})),
+        r"info\['energy'\] carries a gradient",
+    ),
+    (
+        wraps(lambda negative, model: negative._replace(info={"energy": torch.zeros(11)})),
+        r"info\['energy'\] has shape",
+    ),
+]
+
+
+@pytest.mark.parametrize(("broken", "message"), BROKEN_SAMPLERS, ids=[message for _, message in BROKEN_SAMPLERS])
+@pytest.mark.usefixtures("allow_global_rng")
+def test_kit_refuses_a_broken_sampler(broken, message):
+    with pytest.raises(AssertionError, match=f"^{broken.__name__}.*{message}"):
+        check_sampler(broken())
+
+
+def test_kit_accepts_the_sampler_that_the_broken_ones_derive_from():
+    check_sampler(BrokenSampler())
+
+
+def test_kit_refuses_settings_that_can_be_changed():
+    @dataclass
+    class Thawed:
+        k: int = 1
+        init = PCD.init
+        sample = PCD.sample
+        n_chains = None
+
+    with pytest.raises(AssertionError, match=r"^Thawed: the setting 'k' can be changed; freeze the class"):
+        check_sampler(Thawed())
+
+
+# --- broken solvers ---------------------------------------------------------------------------------------
+
+
+def solver_with(change):
+    class BrokenSolver:
+        def minimise(self, qubo, *, generator):
+            return change(BruteForce().minimise(qubo, generator=generator), qubo)
+
+    return BrokenSolver()
+
+
+def replaced(**changes):
+    def change(solution, qubo):
+        parts = {name: make(solution, qubo) for name, make in changes.items()}
+        return dataclasses.replace(solution, **parts)
+
+    return solver_with(change)
+
+
+class GlobalSolver:
+    def minimise(self, qubo, *, generator):
+        torch.empty(3).normal_()
+        return BruteForce().minimise(qubo, generator=generator)
+
+
+class StreamlessSolver:
+    def minimise(self, qubo, *, generator):
+        generator.manual_seed(CALLS.append(0) or len(CALLS))
+        return AlternatingDescent(n_restarts=1).minimise(qubo, generator=generator)
+
+
+def highest_state(solution, qubo):
+    states = binary_states(qubo.n, like=qubo.linear).expand(*qubo.problems, -1, -1)
+    index = qubo.energy(states).argmax(-1)
+    return states.take_along_dim(index[..., None, None], dim=-2)
+
+
+BROKEN_SOLVERS = {
+    "energies are not those of the assignments": replaced(energies=lambda s, q: s.energies - 1),
+    "energies must be float64": replaced(energies=lambda s, q: s.energies.float()),
+    "not binary": replaced(assignments=lambda s, q: 2 * s.assignments - 1),
+    "assignments of another shape": replaced(assignments=lambda s, q: s.assignments[..., 1:]),
+    "energies have shape": replaced(energies=lambda s, q: s.energies.flatten()[None, None, None]),
+    "status or steps": replaced(status=lambda s, q: s.status[..., 0]),
+    "minimum not found": replaced(assignments=highest_state, energies=lambda s, q: q.energy(highest_state(s, q))),
+    "drew from torch's global random stream": GlobalSolver(),
+    "same stream, other answer": StreamlessSolver(),
+}
+
+
+@pytest.mark.parametrize(("message", "solver"), BROKEN_SOLVERS.items(), ids=BROKEN_SOLVERS)
+@pytest.mark.usefixtures("allow_global_rng")
+def test_kit_refuses_a_broken_solver(message, solver):
+    with pytest.raises(AssertionError, match=f"^{type(solver).__name__} on .*{message}"):
+        check_solver(solver)
+
+
+def test_kit_refuses_an_energy_below_the_minimum(monkeypatch):
+    """Only a wrong energy function gets there: elsewhere the energies are compared with it first."""
+    energy = Qubo.energy
+
+    class Lowered:
+        def minimise(self, qubo, *, generator):
+            solution = BruteForce().minimise(qubo, generator=generator)
+            monkeypatch.setattr(Qubo, "energy", lambda self, x: energy(self, x) - 1)
+            return dataclasses.replace(solution, energies=qubo.energy(solution.assignments))
+
+    with pytest.raises(AssertionError, match=r"^Lowered on .*: below the true minimum"):
+        check_solver(Lowered())

@@ -1,0 +1,113 @@
+"""Settings out of range are refused at construction: name, value, what is allowed."""
+
+import dataclasses
+import math
+import re
+
+import pytest
+
+from memcomp_lightning.dmm import AdaptiveEuler, ClauseField, DmmSolver, Recording
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.qubo import AlternatingDescent, BruteForce
+from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
+
+COUNT = "an integer >= 1"
+POSITIVE = "a number > 0"
+REFUSED = [
+    (CD, {"k": 0}, COUNT),
+    (CD, {"k": 1.5}, COUNT),
+    (PCD, {"k": -3}, COUNT),
+    (PCD, {"n_chains": 0}, COUNT),
+    (Quench, {"beta_hot": 1.01}, "a number in [0, 1]"),
+    (Quench, {"beta_hot": -0.01}, "a number in [0, 1]"),
+    (Quench, {"beta_hot": math.nan}, "a number in [0, 1]"),
+    (Quench, {"n_chains": 0}, COUNT),
+    (Exact, {"max_units": 0}, COUNT),
+    (Exact, {"max_units": 21}, "an integer from 1 to 20"),
+    (BruteForce, {"max_variables": 0}, COUNT),
+    (BruteForce, {"chunk_size": 0}, COUNT),
+    (AlternatingDescent, {"n_restarts": 0}, COUNT),
+    (AlternatingDescent, {"max_sweeps": 0}, COUNT),
+    (DmmSolver, {"n_restarts": 0}, COUNT),
+    (DmmSolver, {"max_steps": 0}, COUNT),
+    (DmmSolver, {"patience": 0}, COUNT),
+    (DmmSolver, {"patience": 12, "n_restarts": 11}, "an integer from 1 to n_restarts = 11, or null"),
+    (AdaptiveEuler, {"max_change": 0.0}, POSITIVE),
+    (AdaptiveEuler, {"dt_min": 0.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
+    (AdaptiveEuler, {"dt_min": 3.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
+    (ClauseField, {"alpha": 0.0}, POSITIVE),
+    (ClauseField, {"alpha": math.nan}, POSITIVE),
+    (ClauseField, {"beta": -0.1}, POSITIVE),
+    (ClauseField, {"epsilon": 0.0}, POSITIVE),
+    (ClauseField, {"unit_pull": 0.0}, POSITIVE),
+    (ClauseField, {"gamma": 0.0}, "a number in (0, 1/2)"),
+    (ClauseField, {"gamma": 0.5}, "a number in (0, 1/2)"),
+    (ClauseField, {"delta": 0.0, "gamma": 0.13}, "a number in (0, gamma = 0.13)"),
+    (ClauseField, {"delta": 0.13, "gamma": 0.13}, "a number in (0, gamma = 0.13)"),
+    (ClauseField, {"zeta": -0.1}, "a number >= 0"),
+    (ClauseField, {"long_term_max": 1.0}, "a number > 1"),
+]
+
+
+@pytest.mark.parametrize(("kind", "setting", "allowed"), REFUSED, ids=lambda x: getattr(x, "__name__", str(x)))
+def test_setting_is_refused_with_name_value_and_allowed(kind, setting, allowed):
+    name, value = next(iter(setting.items()))
+    expected = f"{name} = {value!r} is not allowed: expected {allowed}"
+    with pytest.raises(SettingError, match=f"^{re.escape(expected)}"):
+        kind(**setting)
+
+
+@pytest.mark.parametrize(
+    ("every", "allowed"),
+    [(0, COUNT), (2.5, COUNT), (212, "an integer from 1 to max_steps = 211")],
+)
+def test_recording_interval_is_refused(every, allowed):
+    with pytest.raises(SettingError, match=f"^record.every = {every} is not allowed: expected {allowed}"):
+        DmmSolver(max_steps=211, record=Recording(every=every))
+
+
+def test_readout_is_refused_with_the_options():
+    with pytest.raises(
+        SettingError, match=r"^readout = 'bst' is not allowed: expected one of 'best', 'time_average'"
+    ):
+        GroundState(solver=BruteForce(), readout="bst")
+
+
+@pytest.mark.parametrize("solver", [BruteForce(), DmmSolver()], ids=["without the option", "not recording"])
+def test_time_average_of_a_solver_that_records_nothing_is_refused_with_the_remedy(solver):
+    message = f"^solver = '{type(solver).__name__}' is not allowed: .* Use DmmSolver.record=Recording"
+    with pytest.raises(SettingError, match=message):
+        GroundState(solver=solver, readout="time_average")
+
+
+BOUNDS = [
+    (Quench, {"beta_hot": 0.0}),
+    (Quench, {"beta_hot": 1.0}),
+    (Exact, {"max_units": 20}),
+    (DmmSolver, {"patience": 11, "n_restarts": 11}),
+    (DmmSolver, {"max_steps": 1}),
+    (AdaptiveEuler, {"dt_min": 2.3, "dt_max": 2.3}),
+    (ClauseField, {"zeta": 0.0}),
+    (PCD, {"n_chains": None}),
+]
+
+
+@pytest.mark.parametrize(("kind", "setting"), BOUNDS, ids=lambda x: getattr(x, "__name__", str(x)))
+def test_setting_at_its_bound_is_accepted(kind, setting):
+    name, value = next(iter(setting.items()))
+    assert getattr(kind(**setting), name) == value
+
+
+KINDS = [CD, PCD, Quench, Exact, BruteForce, AlternatingDescent, DmmSolver, AdaptiveEuler, ClauseField]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_settings_are_named_frozen_and_known(kind):
+    first = dataclasses.fields(kind)[0].name
+    settings = kind()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(settings, first, getattr(settings, first))
+    with pytest.raises(TypeError, match="positional"):
+        kind(getattr(settings, first))
+    with pytest.raises(TypeError, match="misspelt"):
+        kind(misspelt=1)
