@@ -13,7 +13,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
 from memcomp_lightning.types import Batch, Configurations, NegativePhase
 
 
@@ -120,10 +120,9 @@ class DBNPretraining(StageModule):
         """
         rbm = self.rbm
         with torch.no_grad():
-            v = self.dbn.visible_of(self.layer, batch.v)
-            positive = Configurations(v, rbm.hidden_mean(v))
+            positive = positive_phase(rbm, self.dbn.visible_of(self.layer, batch.v))
         if self._negative is None or self.sampler.uses_data:
-            self._negative = self._negative_phase(rbm, v)
+            self._negative = self._negative_phase(rbm, positive)
         negative = self._negative
         gap = contrast(rbm, positive, negative.configurations)
         loss = batch.share * gap.sum()
@@ -144,15 +143,15 @@ class DBNPretraining(StageModule):
         """Return the layer's visible states ``v`` of held-out images, for the callbacks."""
         return {"v": self.dbn.visible_of(self.layer, batch.v)}
 
-    def _negative_phase(self, rbm: RBM, v: Tensor) -> NegativePhase[Any]:
+    def _negative_phase(self, rbm: RBM, positive: Configurations) -> NegativePhase[Any]:
         """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
         generator = self.streams["negative_phase"]
         if self._sampler_state is None:
-            self._sampler_state = self.sampler.init(rbm, v.shape[-2], generator=generator)
+            self._sampler_state = self.sampler.init(rbm, positive.v.shape[-2], generator=generator)
         negative: NegativePhase[Any] | None = None
         one_for_all = self.sampler.shared and self.trainer.world_size > 1
         if self.trainer.is_global_zero or not one_for_all:
-            negative = self.sampler.sample(rbm, self._sampler_state, v, generator=generator)
+            negative = self.sampler.sample(rbm, self._sampler_state, positive, generator=generator)
         if one_for_all:
             negative = self.trainer.strategy.broadcast(negative)
         if negative is None:

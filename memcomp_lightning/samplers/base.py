@@ -2,9 +2,9 @@
 
 from typing import ClassVar, Protocol, TypeVar
 
-from torch import Generator, Tensor
+from torch import Generator
 
-from memcomp_lightning.types import NegativePhase
+from memcomp_lightning.types import Configurations, NegativePhase
 
 ModelT = TypeVar("ModelT", contravariant=True)
 StateT = TypeVar("StateT")
@@ -16,7 +16,7 @@ class NegativePhaseSampler(Protocol[ModelT, StateT]):
     One object serves every layer and replica: settings are frozen, what a call must remember is the state.
 
     Attributes:
-        uses_data: The negative phase depends on ``v_data`` (contrastive divergence starts there). If not,
+        uses_data: The negative phase depends on the positive one (contrastive divergence starts there). If not,
             one call serves an update however many chunks its images come in.
         shared: The answer depends on the model alone, so with several processes one of them computes it for
             all. Otherwise every process draws its own.
@@ -36,14 +36,15 @@ class NegativePhaseSampler(Protocol[ModelT, StateT]):
         ...
 
     def sample(
-        self, model: ModelT, state: StateT, v_data: Tensor, *, generator: Generator
+        self, model: ModelT, state: StateT, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[StateT]:
         """Return the negative phase of one update.
 
         Args:
             model: The energy model; not changed.
             state: What :meth:`init` or the previous call returned; not changed.
-            v_data: Visible states of the data, ``(*replicas, n, n_visible)`` in [0, 1].
+            positive: The positive phase: ``v`` is data, ``(*replicas, n, n_visible)`` in [0, 1], ``h`` the
+                hidden means given it.
             generator: Random stream of the negative phase.
         """
         ...

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 
+from memcomp_lightning import rng
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.samplers.gibbs import TwoLayerModel, sweep
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
@@ -36,10 +37,12 @@ class CD:
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: NoState, v_data: Tensor, *, generator: Generator
+        self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration an image, k sweeps away from it."""
-        v = v_data
-        for _ in range(self.k):
+        # The first half sweep takes the hidden means that the positive phase has computed already.
+        h = rng.bernoulli(positive.h, generator=generator)
+        v = rng.bernoulli(model.visible_mean(h), generator=generator)
+        for _ in range(self.k - 1):
             v = sweep(model, v, generator=generator)
         return NegativePhase(Configurations(v, model.hidden_mean(v)), state, {})

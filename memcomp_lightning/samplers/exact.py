@@ -66,7 +66,7 @@ class Exact:
 
     @torch.no_grad()
     def sample(
-        self, model: EnumerableModel, state: NoState, v_data: Tensor, *, generator: Generator
+        self, model: EnumerableModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return all configurations with their probabilities as weights."""
         hidden_first = model.n_hidden < model.n_visible

@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.types import Configurations
 
 
 class TwoLayerModel(Protocol):
@@ -33,6 +34,12 @@ class TwoLayerModel(Protocol):
     def visible_mean(self, h: Tensor, *, beta: float = 1.0) -> Tensor:
         """p(v = 1 | h)."""
         ...
+
+
+@torch.no_grad()
+def positive_phase(model: TwoLayerModel, v: Tensor) -> Configurations:
+    """Return data with the hidden means given them, ``E[h | v]``."""
+    return Configurations(v, model.hidden_mean(v))
 
 
 @torch.no_grad()

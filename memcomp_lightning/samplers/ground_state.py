@@ -47,7 +47,7 @@ class GroundState:
 
     @torch.no_grad()
     def sample(
-        self, model: RBM, state: NoState, v_data: Tensor, *, generator: Generator
+        self, model: RBM, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return x* or the weighted trajectory."""
         solution = self.solver.minimise(from_model(model), generator=generator)

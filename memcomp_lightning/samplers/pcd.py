@@ -43,7 +43,7 @@ class PCD:
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: Chains, v_data: Tensor, *, generator: Generator
+        self, model: TwoLayerModel, state: Chains, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[Chains]:
         """Return one configuration a chain."""
         v = state.v

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible, sweep
@@ -37,10 +37,10 @@ class Quench:
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: NoState, v_data: Tensor, *, generator: Generator
+        self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration a start."""
-        v = random_visible(model, self.n_chains or v_data.shape[-2], generator=generator)
+        v = random_visible(model, self.n_chains or positive.v.shape[-2], generator=generator)
         v = sweep(model, v, beta=self.beta_hot, generator=generator)
         v = sweep(model, v, generator=generator)
         return NegativePhase(Configurations(v, model.hidden_mean(v)), state, {})

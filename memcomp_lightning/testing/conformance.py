@@ -9,7 +9,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.models import RBM, Gaussian
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
-from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
 from memcomp_lightning.types import Configurations
 
 
@@ -41,13 +41,14 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
         rbm = small_rbm(replicas=replicas)
         before = [parameter.detach().clone() for parameter in rbm.parameters()]
         v_data = rng.uniform((*replicas, n_data, rbm.n_visible), generator=rng.stream(1, "data"))
+        positive = positive_phase(rbm, v_data)
         global_state = torch.get_rng_state()
         answers = []
         for _ in range(2):
             generator = rng.stream(2, "negative_phase")
             state = sampler.init(rbm, n_data, generator=generator)
             kept = tuple(tensor.clone() for tensor in state)
-            answers.append(sampler.sample(rbm, state, v_data, generator=generator))
+            answers.append(sampler.sample(rbm, state, positive, generator=generator))
             _check(
                 all(a.equal(b) for a, b in zip(kept, state, strict=True)),
                 f"{name} changed the state it was given; return a new one",
@@ -60,7 +61,7 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
         first, second = (answer.configurations for answer in answers)
         _check(first.v.equal(second.v) and first.h.equal(second.h), f"{name}: same stream, other answer")
         _check_configurations(name, first, rbm)
-        loss = contrast(rbm, Configurations(v_data, rbm.hidden_mean(v_data).detach()), first)
+        loss = contrast(rbm, positive, first)
         _check(loss.shape == replicas, f"{name}: contrast has shape {tuple(loss.shape)}, not {replicas}")
         loss.sum().backward()
         for parameter_name, parameter in rbm.named_parameters():

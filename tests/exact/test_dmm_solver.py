@@ -10,9 +10,8 @@ from memcomp_lightning.dmm import AdaptiveEuler, DmmSolver, Recording
 from memcomp_lightning.models import RBM
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import BruteForce, Qubo, Status, from_model, from_qubo
-from memcomp_lightning.samplers import CD, PCD, GroundState
+from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
-from memcomp_lightning.types import Configurations
 
 
 def normal(*shape, seed=0):
@@ -53,10 +52,10 @@ def trained(sampler):
     generator = rng.stream(0, "negative_phase")
     state = sampler.init(rbm, len(v), generator=generator)
     for _ in range(211):
-        negative = sampler.sample(rbm, state, v, generator=generator)
+        positive = positive_phase(rbm, v)
+        negative = sampler.sample(rbm, state, positive, generator=generator)
         state = negative.state
         optimizer.zero_grad()
-        positive = Configurations(v, rbm.hidden_mean(v).detach())
         contrast(rbm, positive, negative.configurations).backward()
         optimizer.step()
     return rbm
@@ -230,7 +229,12 @@ class LateField(ScriptedField):
 
 @pytest.mark.parametrize(
     ("max_steps", "status", "energy"),
-    [(9, Status.STEP_BUDGET, 0), (10, Status.STILL_IMPROVING, -1), (20, Status.STEP_BUDGET, -1)],
+    [
+        (9, Status.STEP_BUDGET, 0),
+        (10, Status.STILL_IMPROVING, -1),
+        (11, Status.STILL_IMPROVING, -1),
+        (12, Status.STEP_BUDGET, -1),
+    ],
 )
 def test_status_tells_when_the_best_came(max_steps, status, energy):
     field = LateField([[0]])
@@ -308,7 +312,7 @@ def test_time_average_weights_each_record_by_its_duration(replicas, patience):
     rbm = small_rbm(replicas=replicas).double()
     solver = DmmSolver(n_restarts=7, patience=patience, max_steps=53, record=Recording(every=3))
     negative = GroundState(solver=solver, readout="time_average").sample(
-        rbm, (), torch.zeros(*replicas, 11, 7).double(), generator=rng.stream(0, "solver")
+        rbm, (), positive_phase(rbm, torch.zeros(*replicas, 11, 7).double()), generator=rng.stream(0, "solver")
     )
     trajectory = solve(solver, from_model(rbm)).trajectory
     v, h, weight = negative.configurations
@@ -325,7 +329,8 @@ def test_time_average_weights_each_record_by_its_duration(replicas, patience):
 def test_best_readout_is_the_ground_state(replicas):
     rbm = small_rbm(replicas=replicas)
     sampler = GroundState(solver=DmmSolver(n_restarts=11, patience=3, max_steps=211))
-    negative = sampler.sample(rbm, (), torch.zeros(*replicas, 11, 7), generator=rng.stream(0, "solver"))
+    positive = positive_phase(rbm, torch.zeros(*replicas, 11, 7))
+    negative = sampler.sample(rbm, (), positive, generator=rng.stream(0, "solver"))
     v, h, weight = negative.configurations
     ground = solve(BruteForce(), from_model(rbm))
     assert weight is None
@@ -346,7 +351,7 @@ def test_diagnostics_count_the_restarts():
 
     rbm = small_rbm(2, 1, replicas=(1,))
     negative = GroundState(solver=Scripted()).sample(
-        rbm, (), torch.zeros(1, 11, 2), generator=rng.stream(0, "solver")
+        rbm, (), positive_phase(rbm, torch.zeros(1, 11, 2)), generator=rng.stream(0, "solver")
     )
     assert negative.info["ground_state_energy"].tolist() == [1.0]
     assert negative.info["restarts_run"].tolist() == [4.0]

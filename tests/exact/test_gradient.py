@@ -6,9 +6,8 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import CD, Exact
+from memcomp_lightning.samplers import CD, Exact, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
-from memcomp_lightning.types import Configurations
 
 SIZES = [(7, 5), (5, 7)]
 REPLICAS = [(), (3,), (2, 3)]
@@ -35,8 +34,8 @@ def negative_log_likelihood(rbm, v):
 
 def gradients(rbm, sampler, v):
     state = sampler.init(rbm, v.shape[-2], generator=rng.stream(0, "negative_phase"))
-    negative = sampler.sample(rbm, state, v, generator=rng.stream(0, "negative_phase"))
-    positive = Configurations(v, rbm.hidden_mean(v))
+    positive = positive_phase(rbm, v)
+    negative = sampler.sample(rbm, state, positive, generator=rng.stream(0, "negative_phase"))
     ours = torch.autograd.grad(contrast(rbm, positive, negative.configurations).sum(), list(rbm.parameters()))
     true = torch.autograd.grad(negative_log_likelihood(rbm, v).sum(), list(rbm.parameters()))
     return ours, true

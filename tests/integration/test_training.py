@@ -77,9 +77,9 @@ def test_one_negative_phase_an_update_unless_it_starts_at_the_data(sampler: Any,
     class Counting:
         uses_data, shared, init = sampler.uses_data, sampler.shared, staticmethod(sampler.init)
 
-        def sample(self, model: Any, state: Any, v_data: torch.Tensor, *, generator: torch.Generator) -> Any:
-            calls.append(v_data.shape[-2])
-            return sampler.sample(model, state, v_data, generator=generator)
+        def sample(self, model: Any, state: Any, positive: Any, *, generator: torch.Generator) -> Any:
+            calls.append(positive.v.shape[-2])
+            return sampler.sample(model, state, positive, generator=generator)
 
     trained_dbn(Counting(), chunk_size=17)
     assert len(calls) == 2 * 4 * calls_an_epoch

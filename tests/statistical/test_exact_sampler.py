@@ -6,7 +6,7 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.samplers import CD, Exact
+from memcomp_lightning.samplers import CD, Exact, positive_phase
 from memcomp_lightning.samplers.gibbs import random_visible
 from memcomp_lightning.testing.conformance import small_rbm
 
@@ -18,7 +18,7 @@ def exact(rbm):
     generator = rng.stream(0, "unused")
     state = sampler.init(rbm, 1, generator=generator)
     v_data = torch.zeros(*rbm.replicas, 1, rbm.n_visible, dtype=rbm.b.dtype)
-    return sampler.sample(rbm, state, v_data, generator=generator).configurations
+    return sampler.sample(rbm, state, positive_phase(rbm, v_data), generator=generator).configurations
 
 
 def moments(configurations):
@@ -59,7 +59,7 @@ def test_moments_agree_with_parallel_chains_and_a_mutant_does_not():
     n = 40_009
     generator = rng.stream(0, "negative_phase")
     start = random_visible(rbm, n, generator=generator)
-    chains = CD(k=31).sample(rbm, (), start, generator=generator).configurations
+    chains = CD(k=31).sample(rbm, (), positive_phase(rbm, start), generator=generator).configurations
     second_moment = (chains.h**2).mT @ (chains.v**2) / n
     measured = moments(chains)[0]
     error = ((second_moment - measured**2) / n).sqrt()

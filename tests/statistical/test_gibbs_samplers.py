@@ -12,7 +12,7 @@ from scipy import stats
 
 from memcomp_lightning import rng
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.samplers import CD, PCD, Quench
+from memcomp_lightning.samplers import CD, PCD, Quench, positive_phase
 from memcomp_lightning.samplers.gibbs import random_visible, sweep
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm
@@ -68,16 +68,16 @@ def draw_cd(rbm, seed):
     v = random_visible(rbm, N_CHAINS, generator=generator)
     sampler = CD(k=N_SWEEPS)
     state = sampler.init(rbm, N_CHAINS, generator=generator)
-    return sampler.sample(rbm, state, v, generator=generator).configurations
+    return sampler.sample(rbm, state, positive_phase(rbm, v), generator=generator).configurations
 
 
 def draw_pcd(rbm, seed):
     generator = rng.stream(seed, "negative_phase")
     sampler = PCD(k=3, n_chains=N_CHAINS)
     state = sampler.init(rbm, 2, generator=generator)
-    v_data = torch.zeros(2, rbm.n_visible)
+    positive = positive_phase(rbm, torch.zeros(2, rbm.n_visible))
     for _ in range(11):
-        negative = sampler.sample(rbm, state, v_data, generator=generator)
+        negative = sampler.sample(rbm, state, positive, generator=generator)
         state = negative.state
     return negative.configurations
 
@@ -122,8 +122,8 @@ def test_persistent_chains_mix_by_their_state_alone():
     state = sampler.init(rbm, 1, generator=rng.stream(0, "negative_phase"))
     state = state._replace(v=torch.ones_like(state.v))
     generator = rng.stream(0, "negative_phase")
-    negative = sampler.sample(rbm, state, torch.zeros(2, 5), generator=generator)
-    negative = sampler.sample(rbm, negative.state, torch.zeros(2, 5), generator=generator)
+    negative = sampler.sample(rbm, state, positive_phase(rbm, torch.zeros(2, 5)), generator=generator)
+    negative = sampler.sample(rbm, negative.state, positive_phase(rbm, torch.zeros(2, 5)), generator=generator)
     kernel = transition_matrix(rbm)
     counts = state_counts(negative.configurations.v)
     assert chi_square_p_value(counts, (kernel @ kernel)[-1]) > LEVEL
@@ -180,7 +180,9 @@ def quench_probabilities(rbm, betas):
 def test_quench_is_one_hot_sweep_and_one_at_beta_1(beta_hot):
     rbm = small_rbm(5, 3, std=4.0)
     sampler = Quench(beta_hot=beta_hot, n_chains=N_CHAINS)
-    negative = sampler.sample(rbm, (), torch.zeros(2, 5), generator=rng.stream(0, "negative_phase"))
+    negative = sampler.sample(
+        rbm, (), positive_phase(rbm, torch.zeros(2, 5)), generator=rng.stream(0, "negative_phase")
+    )
     counts = state_counts(negative.configurations.v)
 
     def p_value(model, betas):

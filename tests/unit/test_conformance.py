@@ -67,15 +67,15 @@ class BrokenSampler(PCD):
 
 
 class ChangesItsState(BrokenSampler):
-    def sample(self, model, state, v_data, *, generator):
+    def sample(self, model, state, positive, *, generator):
         state.v.copy_(sweep(model, state.v, generator=generator))
         return NegativePhase(Configurations(state.v, model.hidden_mean(state.v).detach()), state, {})
 
 
 class DrawsFromTheGlobalStream(BrokenSampler):
-    def sample(self, model, state, v_data, *, generator):
+    def sample(self, model, state, positive, *, generator):
         torch.empty(3).normal_()
-        return PCD.sample(self, model, state, v_data, generator=generator)
+        return PCD.sample(self, model, state, positive, generator=generator)
 
 
 class DrawsFromTheGlobalStreamAtInit(BrokenSampler):
@@ -85,7 +85,7 @@ class DrawsFromTheGlobalStreamAtInit(BrokenSampler):
 
 
 class CarriesAGradient(BrokenSampler):
-    def sample(self, model, state, v_data, *, generator):
+    def sample(self, model, state, positive, *, generator):
         v = model.visible_mean(model.hidden_mean(state.v))
         return NegativePhase(Configurations(v, model.hidden_mean(v).detach()), state, {})
 
@@ -94,8 +94,8 @@ def wraps(change):
     """A sampler whose answer is changed by ``change(negative, model)``."""
 
     class Wrapped(BrokenSampler):
-        def sample(self, model, state, v_data, *, generator):
-            return change(PCD.sample(self, model, state, v_data, generator=generator), model)
+        def sample(self, model, state, positive, *, generator):
+            return change(PCD.sample(self, model, state, positive, generator=generator), model)
 
     return Wrapped
 
@@ -109,16 +109,16 @@ def with_configurations(**changes):
 
 
 class ChangesTheModel(BrokenSampler):
-    def sample(self, model, state, v_data, *, generator):
+    def sample(self, model, state, positive, *, generator):
         with torch.no_grad():
             model.b += 0.1
-        return PCD.sample(self, model, state, v_data, generator=generator)
+        return PCD.sample(self, model, state, positive, generator=generator)
 
 
 class IgnoresTheStream(BrokenSampler):
-    def sample(self, model, state, v_data, *, generator):
+    def sample(self, model, state, positive, *, generator):
         generator.manual_seed(CALLS.append(0) or len(CALLS))
-        return PCD.sample(self, model, state, v_data, generator=generator)
+        return PCD.sample(self, model, state, positive, generator=generator)
 
 
 CALLS = []

@@ -19,7 +19,7 @@ def test_batch_of_one_that_would_broadcast_is_refused():
 
 def test_missing_replica_axis_that_would_broadcast_is_refused():
     rbm = small_rbm(replicas=(3,))
-    with pytest.raises(TypeCheckError, match="hidden_field"):
+    with pytest.raises(TypeCheckError, match="replicas"):
         rbm.free_energy(torch.zeros(11, 7))
 
 
@@ -30,7 +30,7 @@ def test_integer_bits_are_refused():
 
 def test_wrong_result_shape_is_refused():
     class WrongModel:
-        def mean_energy(self, configurations):
+        def total_energy(self, v, h, weight):
             return 0.0
 
     nothing = Configurations(torch.zeros(1, 2), torch.zeros(1, 3))

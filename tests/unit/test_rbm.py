@@ -9,6 +9,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
 from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.objective import contrast
 from memcomp_lightning.testing.conformance import small_rbm
 from memcomp_lightning.types import Configurations
 
@@ -117,6 +118,27 @@ def test_mean_energy_is_the_weighted_mean_of_the_energy(replicas, weighted):
     expected = (rbm.energy(v, h) * weight).sum(-1) / weight.sum(-1)
     given = Configurations(v, h, weight if weighted else None)
     torch.testing.assert_close(rbm.mean_energy(given), expected)
+
+
+@every_replica_shape
+def test_total_energy_takes_weights_of_either_sign(replicas):
+    rbm = small_rbm(replicas=replicas).double()
+    v, h = draw(*replicas, 11, 7), draw(*replicas, 11, 5, seed=1)
+    weight = 2 * draw(*replicas, 11, seed=2) - 1
+    torch.testing.assert_close(rbm.total_energy(v, h, weight), (rbm.energy(v, h) * weight).sum(-1))
+
+
+@every_replica_shape
+@pytest.mark.parametrize("weighted", [False, True])
+def test_contrast_is_the_difference_of_the_mean_energies(replicas, weighted):
+    rbm = small_rbm(replicas=replicas).double()
+    positive = Configurations(draw(*replicas, 11, 7), draw(*replicas, 11, 5, seed=1))
+    weight = 3 * draw(*replicas, 13, seed=4) if weighted else None
+    negative = Configurations(draw(*replicas, 13, 7, seed=2), draw(*replicas, 13, 5, seed=3), weight)
+    share = torch.ones(*replicas, 13).double() if weight is None else weight
+    expected = rbm.energy(positive.v, positive.h).mean(-1)
+    expected = expected - (rbm.energy(negative.v, negative.h) * share).sum(-1) / share.sum(-1)
+    torch.testing.assert_close(contrast(rbm, positive, negative), expected)
 
 
 def test_gradient_of_the_mean_energy_is_that_of_the_mean_of_the_energy():

@@ -28,8 +28,7 @@ from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.models import RBM, Gaussian
 from memcomp_lightning.modules import Score
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import CD
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.samplers import CD, positive_phase
 
 PREFIX = "TheirRBM"
 
@@ -44,10 +43,10 @@ class TheirRBM(pl.LightningModule):
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
         v = batch[0]
-        positive = Configurations(v, self.rbm.hidden_mean(v).detach())
+        positive = positive_phase(self.rbm, v)
         sampler = CD(k=1)
         state = sampler.init(self.rbm, len(v), generator=self.their_generator)
-        negative = sampler.sample(self.rbm, state, v, generator=self.their_generator)
+        negative = sampler.sample(self.rbm, state, positive, generator=self.their_generator)
         gap = contrast(self.rbm, positive, negative.configurations)
         score = Score(gap.detach(), torch.tensor(3), len(v))
         return {
