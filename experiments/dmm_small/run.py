@@ -82,9 +82,8 @@ def main() -> None:
         "32x32, digits, CD-1, 500 epochs": trained_rbms(CD(k=1), 500),
         "32x32, digits, PCD-5, 500 epochs": trained_rbms(PCD(k=5, n_chains=100), 500),
     }
-    print(
-        f"{'family of five RBMs':34s} {'DMM restarts at optimum':>34s} {'descents':>8s} {'calls':>6s} {'s a call':>9s}"
-    )
+    columns = ("family of five RBMs", "DMM restarts at optimum", "descents", "calls", "s a call")
+    print("{:34s} {:>34s} {:>8s} {:>6s} {:>9s}".format(*columns))
     for name, rbm in families.items():
         qubo = from_model(rbm)
         best, how = lowest_energy(qubo)

@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
+from torch.linalg import vecdot
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
@@ -99,7 +100,9 @@ class RBM(nn.Module):
             weighted_v = v * weight.unsqueeze(-1)
             moment = h.mT @ weighted_v
             sum_v, sum_h = weighted_v.sum(-2), (h * weight.unsqueeze(-1)).sum(-2)
-        return -(_dot(self.weight.flatten(-2), moment.flatten(-2)) + _dot(self.b, sum_v) + _dot(self.c, sum_h))
+        coupled: Tensor = vecdot(self.weight.flatten(-2), moment.flatten(-2))
+        biases: Tensor = vecdot(self.b, sum_v) + vecdot(self.c, sum_h)
+        return -(coupled + biases)
 
     def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
         r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
@@ -137,8 +140,3 @@ class RBM(nn.Module):
 def _scaled(field: Tensor, beta: float) -> Tensor:
     """Field times beta, without a pass over memory in the usual case."""
     return field if beta == 1.0 else beta * field
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product along the last axis, without a temporary of its size."""
-    return (a.unsqueeze(-2) @ b.unsqueeze(-1)).squeeze((-1, -2))

@@ -44,18 +44,23 @@ def memcomp_train(
     return run
 
 
+def launch(*arguments: str, folder: Path) -> "subprocess.Popen[str]":
+    """Start ``memcomp-train`` as a process of its own; one thread, on which the last bits depend."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "memcomp_lightning.cli.train", *arguments],
+        cwd=folder,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
 @pytest.fixture
 def start_process(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
-    """Start ``memcomp-train`` as a process of its own, one thread."""
+    """Start ``memcomp-train`` in the test's folder."""
 
-    def start(*arguments: str, folder: Path = tmp_path) -> "subprocess.Popen[str]":
-        return subprocess.Popen(
-            [sys.executable, "-m", "memcomp_lightning.cli.train", *arguments],
-            cwd=folder,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    def start(*arguments: str) -> "subprocess.Popen[str]":
+        return launch(*arguments, folder=tmp_path)
 
     return start

@@ -2,13 +2,13 @@
 
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from conftest import launch
 
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [
@@ -35,8 +35,9 @@ def wait_for_epoch(process: "subprocess.Popen[str]", checkpoint: Path, epoch: in
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("uninterrupted")
-    command = ["-m", "memcomp_lightning.cli.train", *RUN, "hydra.run.dir=run"]
-    subprocess.run([sys.executable, *command], cwd=folder, check=True, capture_output=True)
+    process = launch(*RUN, "hydra.run.dir=run", folder=folder)
+    _, err = process.communicate()
+    assert process.returncode == 0, err
     return folder / "run"
 
 
