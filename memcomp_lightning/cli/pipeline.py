@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
@@ -112,16 +113,23 @@ def _record(stage: Stage) -> dict[str, Any]:
 
 def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]) -> None:
     """The final numbers, beside the settings in TensorBoard's HParams tab."""
-    metrics = {"final/wall_time_s": sum(record["wall_time_s"] for record in result["stages"].values())}
-    for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
-        metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
+    metrics: dict[str, float] = {}
     if "test_accuracy" in result:
         metrics["final/test_accuracy"] = sum(result["test_accuracy"]) / len(result["test_accuracy"])
-    groups = ("data", "model", "sampler", "solver", "pretrain", "finetune")
-    settings = {group: OmegaConf.to_container(config[group], resolve=True) for group in groups}
-    write_hyper_parameters(loggers, {"seed": config.seed, **settings}, metrics)
+    for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
+        metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
+    metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
+    write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)
     for logger in loggers:
         logger.finalize("success")
+
+
+def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, Any]:
+    """What tells runs of a sweep apart: TensorBoard shows the first five, and more where more was overridden."""
+    choices = HydraConfig.get().runtime.choices
+    settings: dict[str, Any] = {group: choices[group] for group in ("data", "model", "sampler")}
+    settings |= {"seed": config.seed, "pretrain.iterations": config.pretrain.iterations}
+    return {**settings, **{name: value for name, value in overrides.items() if name not in settings}}
 
 
 def _numbers(values: Tensor) -> list[float]:
