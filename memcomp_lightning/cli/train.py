@@ -6,6 +6,7 @@ import sys
 import traceback
 import warnings
 from pathlib import Path
+from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -18,6 +19,8 @@ from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import closing_lines, run_table
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.modules import CheckpointError
 
 USAGE_ERROR = 2
 """Exit status when a setting is refused."""
@@ -35,10 +38,18 @@ def train(config: DictConfig) -> None:
     try:
         _train(config, folder, _overrides(settings.overrides.task))
     except Exception as error:
+        if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError)):
+            refuse(error)
         if not in_sweep:
             raise
         folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
         log.error("Failed, the sweep goes on: %s", explain(error))
+
+
+def refuse(error: Exception) -> NoReturn:
+    """End with the message alone."""
+    print(f"memcomp-train: {error}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> None:
@@ -105,8 +116,7 @@ def main() -> None:
             sweep.check_overrides(overrides, multirun=multirun)
         train()
     except UserError as error:
-        print(f"memcomp-train: {error}", file=sys.stderr)
-        sys.exit(USAGE_ERROR)
+        refuse(error)
     except KeyboardInterrupt as interrupt:
         how = str(interrupt)
         if sweep.RememberSweepFolder.folder is not None:

@@ -114,8 +114,28 @@ def test_missing_mnist_says_what_where_and_how(memcomp_train: Run) -> None:
 def test_folder_of_other_settings_is_refused(memcomp_train: Run) -> None:
     assert memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run").status == 0
     outcome = memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run", "pretrain.iterations=3")
-    assert outcome.status != 0
+    assert outcome.status == 2
     assert "pretrain.iterations=2, not 3" in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+def test_truncated_checkpoint_is_named(memcomp_train: Run) -> None:
+    arguments = ("sampler=cd", *FAST, "hydra.run.dir=run")
+    assert memcomp_train(*arguments).status == 0
+    weights = Path("run/weights/pretrain.pt")
+    Path("run/result.json").unlink()
+    weights.write_bytes(weights.read_bytes()[:500])
+    outcome = memcomp_train(*arguments)
+    assert outcome.status == 2
+    assert "run/weights/pretrain.pt" in outcome.err
+    assert "Traceback" not in outcome.err
+    Path("run/stages.json").unlink()
+    checkpoint = Path("run/checkpoints/pretrain/last.ckpt")
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    checkpoint.write_bytes(b"PK\x03\x04")
+    outcome = memcomp_train(*arguments)
+    assert outcome.status == 2
+    assert "run/checkpoints/pretrain/last.ckpt" in outcome.err
 
 
 def test_finished_run_is_not_repeated(memcomp_train: Run) -> None:

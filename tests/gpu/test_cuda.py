@@ -1,0 +1,64 @@
+"""The same numbers on a CUDA device, where there is one."""
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.data import Digits, ImageDataModule
+from memcomp_lightning.dmm import DmmSolver, Recording
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
+from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo, from_model
+from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench, positive_phase
+from memcomp_lightning.testing.conformance import small_rbm
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+
+@pytest.mark.parametrize(
+    "sampler",
+    [CD(k=3), PCD(k=2, n_chains=11), Exact(), Quench(n_chains=11), GroundState(solver=BruteForce())],
+    ids=lambda sampler: type(sampler).__name__,
+)
+def test_samplers_draw_the_same_on_both_devices(sampler) -> None:
+    answers = []
+    for device in ("cpu", "cuda"):
+        rbm = small_rbm(replicas=(3,)).double().to(device)
+        v = rng.uniform((3, 11, 7), generator=rng.stream(1, "data"), like=rbm.b)
+        generator = rng.stream(2, "negative_phase")
+        state = sampler.init(rbm, 11, generator=generator)
+        configurations = sampler.sample(rbm, state, positive_phase(rbm, v), generator=generator).configurations
+        assert configurations.v.device.type == device
+        answers.append([part.cpu() for part in configurations if part is not None])
+    for cpu, cuda in zip(*answers, strict=True):
+        torch.testing.assert_close(cuda, cpu)
+
+
+@pytest.mark.parametrize("solver", [AlternatingDescent(), DmmSolver(patience=7, record=Recording())])
+def test_solvers_find_the_optimum_on_the_device(solver) -> None:
+    matrix = torch.empty(2, 7, 7).normal_(generator=rng.stream(3, "matrix"))
+    for qubo in (from_model(small_rbm(replicas=(3,)).cuda()), Qubo.from_matrix(matrix.cuda())):
+        exact = BruteForce().minimise(qubo, generator=rng.stream(0, "unused")).best_energy
+        solution = solver.minimise(qubo, generator=rng.stream(4, "solver"))
+        assert solution.best.device.type == "cuda"
+        torch.testing.assert_close(solution.best_energy, exact, rtol=1e-6, atol=1e-9)
+
+
+def test_training_runs_on_the_device() -> None:
+    data = ImageDataModule(Digits().load(), batch_size=100, partitions=2)
+    dbn = DBN(32, [7, 5], replicas=(2,))
+    for module in (DBNPretraining(dbn, PCD(n_chains=11), iterations=2), DBNClassifier(dbn, iterations=2)):
+        trainer = pl.Trainer(
+            max_epochs=module.n_epochs,
+            accelerator="cuda",
+            devices=1,
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+        )
+        trainer.fit(module, datamodule=data)
+    assert evaluate(module.network, data.test_dataloader()).accuracy.shape == (2,)
