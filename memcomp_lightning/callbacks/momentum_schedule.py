@@ -1,6 +1,7 @@
 """The paper's momentum: small for the first iterations, larger after."""
 
 import lightning.pytorch as pl
+from torch.optim import Optimizer
 
 from memcomp_lightning.callbacks.base import iteration_of
 from memcomp_lightning.errors import require, require_count
@@ -26,20 +27,25 @@ class MomentumSchedule(pl.Callback):
         self.final = final
         self.switch_at = switch_at
 
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Refuse optimisers without momentum.
+    @staticmethod
+    def check(optimizer: Optimizer) -> None:
+        """Refuse an optimiser without momentum.
 
         Raises:
             SettingError: Naming the optimiser.
         """
+        require(
+            "momentum" in optimizer.param_groups[0],
+            "optimizer",
+            type(optimizer).__name__,
+            "one with a 'momentum' setting (torch.optim.SGD, RMSprop) for MomentumSchedule",
+            "Leave the schedule out: callbacks.pretrain.momentum_schedule=null, callbacks.finetune likewise.",
+        )
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Refuse optimisers without momentum."""
         for optimizer in trainer.optimizers:
-            require(
-                "momentum" in optimizer.param_groups[0],
-                "optimizer",
-                type(optimizer).__name__,
-                "one with a 'momentum' setting (torch.optim.SGD, RMSprop) for MomentumSchedule",
-                "Leave the schedule out: callbacks.momentum_schedule=null.",
-            )
+            self.check(optimizer)
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Set the momentum of this pass."""

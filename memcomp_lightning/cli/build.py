@@ -1,7 +1,8 @@
 """From a configuration to the objects of a run; everything that can be refused is refused here."""
 
+import math
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
+from memcomp_lightning.callbacks import MomentumSchedule
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
@@ -70,6 +72,7 @@ def build(config: DictConfig) -> Plan:
     for group, known in _SETTINGS.items():
         for name in config if group == "" else config[group]:
             require_choice(f"setting {group}".rstrip(), name, known)
+    _check_finite(config)
     seed = config.seed
     require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
     images = _load(instantiate(config.data.source))
@@ -134,7 +137,9 @@ def _network(config: DictConfig, images: ImageData) -> tuple[nn.Module, Any]:
     except TypeError as error:
         raise UserError(f"model: {error}") from error
     if weights is not None:
+        require(isinstance(weights, str), "model.weights", weights, "the path of a weight file, or null")
         load_weights(network, Path(weights))
+    network.to(_PRECISIONS.get(str(config.trainer.precision), torch.float32))
     return network, factory.keywords.get("weight_init")
 
 
@@ -156,7 +161,10 @@ def _optimizer(config: DictConfig, stage: str) -> OptimizerFactory:
     """The optimiser's factory, tried on one parameter so that bad settings show before training."""
     factory: OptimizerFactory = instantiate(config[stage].optimizer)
     try:
-        factory([nn.Parameter(torch.zeros(1))])
+        optimizer = factory([nn.Parameter(torch.zeros(1))])
+        for callback in _callbacks(config, stage):
+            if isinstance(callback, MomentumSchedule):
+                callback.check(optimizer)
     except (TypeError, ValueError) as error:
         raise UserError(f"{stage}.optimizer: {error}") from error
     return factory
@@ -166,7 +174,20 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
     return [instantiate(callback) for callback in config.callbacks[stage].values() if callback is not None]
 
 
-@cache
+def _check_finite(node: Any, name: str = "") -> None:
+    """Refuse NaN and infinity anywhere: optimisers and samplers would take some of them."""
+    if isinstance(node, DictConfig):
+        for key in node:
+            if not OmegaConf.is_interpolation(node, str(key)):
+                _check_finite(node[key], f"{name}.{key!s}".lstrip("."))
+    elif isinstance(node, float):
+        require(math.isfinite(node), name, node, "a finite number")
+
+
+_PRECISIONS = {"64-true": torch.float64, "16-true": torch.float16, "bf16-true": torch.bfloat16}
+
+
+@lru_cache(maxsize=1)
 def _load(source: ImageSource) -> ImageData:
-    """Load a data set once a process: the jobs of a sweep share it."""
+    """Load a data set once for the jobs of a sweep; sources are frozen, hence hashable."""
     return source.load()

@@ -15,6 +15,7 @@ class UserError(Exception):
 CONFIGURATION_ERRORS = (
     UserError,
     ValueError,
+    TypeError,
     OSError,
     HydraException,
     OmegaConfBaseException,

@@ -1,6 +1,7 @@
 """The stages of one run, each picked up where it was left."""
 
 import logging
+from pathlib import Path
 from typing import Any, cast
 
 import lightning.pytorch as pl
@@ -15,9 +16,9 @@ from torch import Tensor
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.modules import Classifier, DBNPretraining, evaluate, load_weights, save_weights
-from memcomp_lightning.modules.weights import check_fits, read_checkpoint
+from memcomp_lightning.modules.weights import AtomicCheckpointIO, check_fits, read_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         trainer = _fit(stage, config, folder, loggers)
         is_global_zero = trainer.is_global_zero
         records[name] = _record(stage)
-        if is_global_zero:
+        if is_global_zero and not config.trainer.fast_dev_run:
             save_weights(_trained(stage), folder.weights(name))
             folder.finish_stage(name, records[name])
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
@@ -48,16 +49,38 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         score = evaluate(_trained(plan.finetuning), plan.finetuning.data.test_dataloader())
         result["test_accuracy"] = _numbers(score.accuracy)
         result["test_loss"] = _numbers(score.mean_loss)
-    if is_global_zero:
+    if is_global_zero and not config.trainer.fast_dev_run:
         _log_final(loggers, config, result)
         folder.finish(result)
     return result
 
 
+_SET_BY_STAGE = (
+    "max_epochs",
+    "callbacks",
+    "logger",
+    "use_distributed_sampler",
+    "enable_model_summary",
+    "num_sanity_val_steps",
+    "default_root_dir",
+    "plugins",
+)
+_NOT_WITH_OWN_STEPS = ("gradient_clip_val", "gradient_clip_algorithm", "accumulate_grad_batches")
+
+
 def make_trainer(
-    config: DictConfig, *, max_epochs: int, callbacks: list[pl.Callback], loggers: list[Logger]
+    config: DictConfig, *, max_epochs: int, callbacks: list[pl.Callback], loggers: list[Logger], folder: Path
 ) -> pl.Trainer:
-    """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group."""
+    """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group.
+
+    Raises:
+        SettingError, MisconfigurationException: A setting is not for the user to set, or out of range.
+    """
+    for name, value in config.trainer.items():
+        allowed = "nothing, each stage sets it"
+        require(name not in _SET_BY_STAGE, f"trainer.{name}", value, allowed, "Use the groups of the stages.")
+        allowed = "nothing, the stages step their optimisers themselves"
+        require(name not in _NOT_WITH_OWN_STEPS, f"trainer.{name}", value, allowed, "Use batch_size.")
     settings = OmegaConf.to_container(config.trainer, resolve=True)
     assert isinstance(settings, dict)
     require_count("trainer.checkpoint_every", settings.pop("checkpoint_every"))
@@ -70,6 +93,8 @@ def make_trainer(
         use_distributed_sampler=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
+        default_root_dir=folder,
+        plugins=[AtomicCheckpointIO()],
     )
     return trainer
 
@@ -84,7 +109,11 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
         enable_version_counter=False,
     )
     trainer = make_trainer(
-        config, max_epochs=stage.module.n_epochs, callbacks=[*stage.callbacks, keep_last], loggers=loggers
+        config,
+        max_epochs=stage.module.n_epochs,
+        callbacks=[*stage.callbacks, keep_last],
+        loggers=loggers,
+        folder=path.parent,
     )
     resume_from = None
     if path.exists():
@@ -92,6 +121,11 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
         resume_from = path
         log.info("Going on from %s", path)
     trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
+    if trainer.current_epoch < stage.module.n_epochs and not config.trainer.fast_dev_run:
+        raise RuntimeError(
+            f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes (a "
+            "limit of the trainer, or a callback): its weights are not recorded as trained."
+        )
     return trainer
 
 

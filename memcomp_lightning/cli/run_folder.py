@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,13 @@ class RunFolder:
         """The checkpoint that a stage goes on from."""
         return self.path / "checkpoints" / stage / "last.ckpt"
 
-    def open(self, config: DictConfig) -> None:
+    @property
+    def overrides(self) -> list[str] | None:
+        """The command line that the folder was made with, None if it is not a run folder."""
+        found = self._read("overrides.json")
+        return None if found is None else list(found["overrides"])
+
+    def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
         """Make the folder, or check that it belongs to the same settings.
 
         Raises:
@@ -65,6 +72,7 @@ class RunFolder:
             if settings.exists():
                 self._check_same(settings, config)
             else:
+                self._write("overrides.json", {"overrides": list(overrides)})
                 write_text(settings, OmegaConf.to_yaml(config))
         except OSError as error:
             raise UserError(
@@ -96,7 +104,7 @@ class RunFolder:
     def _check_same(self, path: Path, config: DictConfig) -> None:
         there, now = _flat(OmegaConf.load(path)), _flat(config)
         for name in sorted(there.keys() | now.keys()):
-            if there.get(name) != now.get(name):
+            if there.get(name) != now.get(name) and not name.startswith(_FREE_TO_CHANGE):
                 raise UserError(
                     f"run folder {self.path} was made with {name}={there.get(name)}, not {now.get(name)}: choose "
                     "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
@@ -111,6 +119,10 @@ class RunFolder:
 
     def _write(self, name: str, content: dict[str, Any]) -> None:
         write_text(self.path / name, json.dumps(content, indent=1) + "\n")
+
+
+_FREE_TO_CHANGE = ("logger.", "trainer.checkpoint_every", "data.source.data_dir", "data.source.download")
+"""Settings that do not change what is computed."""
 
 
 def _flat(node: Any, prefix: str = "") -> dict[str, Any]:

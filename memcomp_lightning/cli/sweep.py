@@ -1,6 +1,7 @@
 """Multirun: every job checked before the first one trains, one merged table at the end."""
 
 import csv
+import hashlib
 import io
 import tempfile
 from collections import defaultdict
@@ -12,7 +13,7 @@ from hydra import compose, initialize_config_module
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
@@ -21,6 +22,25 @@ from memcomp_lightning.cli.run_folder import RunFolder, write_text
 from memcomp_lightning.cli.table import aligned, mean_and_error, with_error
 
 CONFIG_MODULE = "memcomp_lightning.conf"
+
+
+LONGEST_NAME = 150
+"""Characters of a job's folder; file systems allow 255."""
+
+
+def job_folder(overrides: str) -> str:
+    """Name of a job's folder: its overrides, as one path component that every file system takes.
+
+    >>> job_folder("sampler=cd,model.weights=runs/a.pt")
+    'sampler=cd,model.weights=runs_a.pt'
+    """
+    name = overrides.replace("/", "_").replace("\\", "_")
+    if len(name) > LONGEST_NAME:
+        name = f"{name[:LONGEST_NAME]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
+    return name or "job"
+
+
+OmegaConf.register_new_resolver("memcomp_job_folder", job_folder, replace=True)
 
 
 class RememberSweepFolder(Callback):
@@ -52,8 +72,10 @@ def check_overrides(overrides: Sequence[str], *, multirun: bool) -> None:
         for job in jobs:
             try:
                 config = compose("config", job)
-                build(config)
-                make_trainer(config, max_epochs=1, callbacks=[], loggers=[])
+                plan = build(config)
+                world_size = make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path()).world_size
+                for stage in plan.stages:
+                    stage.data.train_batches(0, world_size)
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
@@ -101,8 +123,8 @@ def merge(folder: Path) -> tuple[str, int]:
         job = RunFolder(path)
         if (result := job.result) is not None:
             groups[tuple((k, v) for k, v in result["overrides"].items() if k != "seed")].append(result)
-        elif (error := job.error) is not None:
-            failed.append((path.name, error["error"]))
+        else:
+            failed.append((path.name, (job.error or {"error": "did not finish"})["error"]))
     text = _table(groups, folder) if groups else "No job has finished."
     if failed:
         listing = "\n".join(f"  {name}\n    {error}" for name, error in failed)

@@ -12,7 +12,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from memcomp_lightning.cli import pipeline, sweep
 from memcomp_lightning.cli.build import build
@@ -36,7 +36,7 @@ def train(config: DictConfig) -> None:
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
-        _train(config, folder, _overrides(settings.overrides.task))
+        _train(config, folder, list(settings.overrides.task))
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError)):
             refuse(error)
@@ -52,14 +52,14 @@ def refuse(error: Exception) -> NoReturn:
     sys.exit(USAGE_ERROR)
 
 
-def _train(config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> None:
+def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     plan = build(config)
     if _is_first_process():
-        folder.open(config)
+        folder.open(config, overrides)
     result = folder.result
     if result is None:
         try:
-            result = pipeline.run(plan, config, folder, overrides)
+            result = pipeline.run(plan, config, folder, _by_name(overrides))
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
             raise KeyboardInterrupt(f"Go on with: memcomp-train resume={_short(folder.path)}") from stop
     else:
@@ -73,8 +73,8 @@ def _is_first_process() -> bool:
     return int(getattr(rank_zero_only, "rank", 0)) == 0
 
 
-def _overrides(task_overrides: list[str]) -> dict[str, str]:
-    pairs = (override.partition("=") for override in task_overrides)
+def _by_name(overrides: list[str]) -> dict[str, str]:
+    pairs = (override.partition("=") for override in overrides)
     return {name: value for name, _, value in pairs}
 
 
@@ -88,15 +88,15 @@ def _resumed(arguments: list[str]) -> list[str]:
     folders = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     if not folders:
         return arguments
-    folder = Path(folders[-1])
-    saved = folder / ".hydra" / "overrides.yaml"
-    if not saved.is_file():
+    folder = Path(folders[-1].strip("'\""))
+    overrides = RunFolder(folder).overrides
+    if overrides is None:
         raise UserError(
-            f"resume={folder}: there is no {saved}. Name the folder of a run of memcomp-train (one that holds "
-            "settings.yaml); a sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
+            f"resume={folder}: there is no overrides.json. Name the folder of a run of memcomp-train; a sweep "
+            "goes on when the same command is given with hydra.sweep.dir=FOLDER."
         )
-    overrides = [str(override) for override in OmegaConf.load(saved)]
-    return [*overrides, *(a for a in arguments if not a.startswith("resume=")), f"hydra.run.dir={folder}"]
+    quoted = str(folder).replace("'", r"\'")
+    return [*overrides, *(a for a in arguments if not a.startswith("resume=")), f"hydra.run.dir='{quoted}'"]
 
 
 def main() -> None:

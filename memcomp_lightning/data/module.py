@@ -70,7 +70,7 @@ class ImageDataModule(LightningDataModule):
             self._train = self._take(order[..., : self.n_train])
             if n_held_out:
                 self._held_out = self._take(order[..., self.n_train :])
-        self._train_batches(rank=0, world_size=1)
+        self.train_batches(rank=0, world_size=1)
 
     @property
     def n_visible(self) -> int:
@@ -94,8 +94,8 @@ class ImageDataModule(LightningDataModule):
             SettingError: A step has fewer images than there are processes.
         """
         if self.trainer is None:
-            return self._train_batches(rank=0, world_size=1)
-        return self._train_batches(self.trainer.global_rank, self.trainer.world_size)
+            return self.train_batches(rank=0, world_size=1)
+        return self.train_batches(self.trainer.global_rank, self.trainer.world_size)
 
     def val_dataloader(self) -> Batches:
         """Return the held-out images, or the test images if none are held out."""
@@ -105,7 +105,8 @@ class ImageDataModule(LightningDataModule):
         """Return the test images, the same for every replica."""
         return self._evaluation_batches(self.images.test_v, self.images.test_label)
 
-    def _train_batches(self, rank: int, world_size: int) -> Batches:
+    def train_batches(self, rank: int, world_size: int) -> Batches:
+        """Return the shuffled training batches of one of ``world_size`` processes."""
         return Batches(
             *self._train,
             batch_size=self._batch_size,

@@ -51,6 +51,8 @@ class ClauseField:
         \dot x_l &= \alpha (C - \delta) \cdot (x_l - 1 \text{ if } C < \delta \text{ else } 1),
                     \quad x_l \in [1, x_{max}]
 
+    Deviation: no noise on the voltages; it hardly mattered in the search for the constants.
+
     Weights are divided by ``rms(w) sqrt(longest layer or largest degree)``, so that the drive of a voltage
     does not depend on the problem's scale and size.
 

@@ -112,9 +112,16 @@ class DmmSolver:
 
     def _run(self, qubo: Qubo, n_restarts: int, generator: Generator) -> reference.Run:
         maxsat = from_qubo(qubo)
-        state = self.field.init(self.field.build(maxsat), n_restarts, generator=generator)
+        machine = self.field.build(maxsat)
         return reference.run(
-            self.field, self.integrator, maxsat, qubo, state, n_steps=self.max_steps, recording=self.record
+            self.field,
+            self.integrator,
+            machine,
+            self.field.init(machine, n_restarts, generator=generator),
+            qubo,
+            offset=maxsat.offset,
+            n_steps=self.max_steps,
+            recording=self.record,
         )
 
 

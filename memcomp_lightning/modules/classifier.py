@@ -55,8 +55,8 @@ def evaluate(network: nn.Module, batches: Any) -> Score:
     """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
     was_training = network.training
     network.eval()
-    device = next(network.parameters()).device
-    scores = [score(network(batch.v.to(device)), batch.label.to(device)) for batch in batches]
+    like = next(network.parameters())
+    scores = [score(network(batch.v.to(like)), batch.label.to(like.device)) for batch in batches]
     network.train(was_training)
     return sum(scores[1:], start=scores[0])
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any, cast
 
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
@@ -153,7 +154,8 @@ class DBNPretraining(StageModule):
         if self.trainer.is_global_zero or not one_for_all:
             negative = self.sampler.sample(rbm, self._sampler_state, positive, generator=generator)
         if one_for_all:
-            negative = self.trainer.strategy.broadcast(negative)
+            negative = self.trainer.strategy.broadcast(move_data_to_device(negative, "cpu"))
+            negative = move_data_to_device(negative, self.device)
         if negative is None:
             raise RuntimeError("the process of rank 0 sent no negative phase")
         self._sampler_state = negative.state
@@ -172,7 +174,8 @@ class DBNPretraining(StageModule):
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains and the energy gaps."""
         chains = None if self._sampler_state is None else dict(self._sampler_state._asdict())
-        return {"sampler": chains, "energy_gaps": list(self.energy_gaps)}
+        state = {"sampler": chains, "energy_gaps": list(self.energy_gaps)}
+        return cast(dict[str, Any], move_data_to_device(state, "cpu"))
 
     def take_extra_state(self, state: dict[str, Any]) -> None:
         """Take back the sampler's chains and the energy gaps."""

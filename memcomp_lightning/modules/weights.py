@@ -1,12 +1,11 @@
 """Weight files: written whole or not at all, read without executing code, refused with the cause."""
 
 import os
-import pickle
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
 
@@ -16,10 +15,26 @@ class CheckpointError(ValueError):
 
 def save_weights(module: nn.Module, path: Path) -> None:
     """Write the module's state dict; an interruption leaves no half-written file."""
+    _write(module.state_dict(), path)
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's checkpoints, each written beside its place and then renamed.
+
+    Lightning's own way goes through the system's temporary folder, which may be on another file system: there
+    the last step is a copy that an interruption can truncate.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint, or leave the old one."""
+        _write(checkpoint, Path(path))
+
+
+def _write(content: Any, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        torch.save(module.state_dict(), partial)
+        torch.save(content, partial)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -35,15 +50,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"checkpoint {path} does not exist.")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except Exception as error:  # torch raises half a dozen kinds for damaged files
         raise CheckpointError(
-            f"checkpoint {path} holds more than tensors and plain values, or is damaged; code in checkpoints "
-            f"is never executed. Use a file that memcomp-train wrote. ({str(error).splitlines()[0]})"
-        ) from error
-    except (RuntimeError, EOFError, OSError, zipfile.BadZipFile, ValueError) as error:
-        raise CheckpointError(
-            f"checkpoint {path} ({path.stat().st_size} bytes) cannot be read, it seems truncated: delete it "
-            f"and start from an earlier one. ({str(error).splitlines()[0]})"
+            f"checkpoint {path} ({path.stat().st_size} bytes) is truncated or damaged, or holds more than tensors "
+            "and plain values, and code in checkpoints is never executed. Delete it to train that stage again, or "
+            f"use a file that memcomp-train wrote. ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
         ) from error
     if not isinstance(content, dict):
         raise CheckpointError(f"checkpoint {path} holds a {type(content).__name__}, expected a dictionary.")

@@ -23,7 +23,8 @@ class PCD:
 
     Attributes:
         k: Sweeps an update, >= 1.
-        n_chains: Chains a replica, >= 1; None takes the number of images of an update.
+        n_chains: Chains a replica, >= 1; None takes as many as there are images in the batch
+            (the chunk, of this process) at hand.
     """
 
     uses_data: ClassVar[bool] = False

@@ -17,7 +17,8 @@ class Quench:
 
     Attributes:
         beta_hot: Inverse temperature of the first sweep, in [0, 1].
-        n_chains: Starts a replica, >= 1; None takes the number of images of an update.
+        n_chains: Starts a replica, >= 1; None takes as many as there are images in the batch
+            (the chunk, of this process) at hand.
     """
 
     uses_data: ClassVar[bool] = False

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.models import RBM, Gaussian
@@ -59,6 +60,7 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
             f"{name} changed the model",
         )
         first, second = (answer.configurations for answer in answers)
+        _check_declarations(sampler, rbm, v_data, first)
         _check(first.v.equal(second.v) and first.h.equal(second.h), f"{name}: same stream, other answer")
         _check_configurations(name, first, rbm)
         loss = contrast(rbm, positive, first)
@@ -86,6 +88,20 @@ def _check_frozen(sampler: object) -> None:
         except AttributeError:
             continue
         _check(False, f"{type(sampler).__name__}: the setting {setting!r} can be changed; freeze the class")
+
+
+def _check_declarations(
+    sampler: NegativePhaseSampler[Any, Any], rbm: RBM, v_data: Tensor, answer: Configurations
+) -> None:
+    """``uses_data`` and ``shared`` are there, and a sampler that denies using the data does not."""
+    name = type(sampler).__name__
+    for attribute in ("uses_data", "shared"):
+        _check(isinstance(getattr(sampler, attribute, None), bool), f"{name}.{attribute} must be True or False")
+    if not sampler.uses_data:
+        generator = rng.stream(2, "negative_phase")
+        state = sampler.init(rbm, v_data.shape[-2], generator=generator)
+        other = sampler.sample(rbm, state, positive_phase(rbm, 1 - v_data), generator=generator).configurations
+        _check(other.v.equal(answer.v), f"{name} says uses_data = False, but other data give another answer")
 
 
 def _check_configurations(name: str, configurations: Configurations, rbm: RBM) -> None:

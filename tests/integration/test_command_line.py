@@ -89,7 +89,12 @@ REFUSED = {
     "callbacks.pretrain.momentum_schedule.initial=2": ["momentum initial = 2", "[0, 1)"],
     "+keep=1": ["setting = 'keep'", "'pretrain'"],
     "+pretrain.lr=1": ["setting pretrain = 'lr'", "'optimizer'"],
-    "resume=nowhere": ["resume=nowhere", "overrides.yaml"],
+    "data.validation_fraction=abc": ["abc"],
+    "pretrain.optimizer.lr=nan": ["pretrain.optimizer.lr = nan", "a finite number"],
+    "finetune.optimizer._target_=torch.optim.Adam": ["'Adam'", "callbacks.pretrain.momentum_schedule=null"],
+    "+trainer.max_epochs=3": ["trainer.max_epochs = 3", "each stage sets it"],
+    "+trainer.gradient_clip_val=1": ["trainer.gradient_clip_val = 1", "step their optimisers themselves"],
+    "resume=nowhere": ["resume=nowhere", "overrides.json"],
 }
 
 
@@ -136,6 +141,38 @@ def test_truncated_checkpoint_is_named(memcomp_train: Run) -> None:
     outcome = memcomp_train(*arguments)
     assert outcome.status == 2
     assert "run/checkpoints/pretrain/last.ckpt" in outcome.err
+
+
+def test_a_refused_command_does_not_spoil_resume(memcomp_train: Run) -> None:
+    folder = "a run,sampler=cd"
+    assert memcomp_train("sampler=cd", *FAST, f"hydra.run.dir='{folder}'").status == 0
+    assert memcomp_train("sampler=pcd", *FAST, f"hydra.run.dir='{folder}'").status == 2
+    outcome = memcomp_train(f"resume={folder}")
+    assert outcome.status == 0, outcome.err
+    assert "test accuracy" in outcome.out
+
+
+def test_a_stage_cut_short_is_not_recorded(memcomp_train: Run) -> None:
+    outcome = memcomp_train("sampler=cd", *FAST, "+trainer.max_time=00:00:00:00", "hydra.run.dir=run")
+    assert outcome.status != 0
+    assert "not recorded as trained" in outcome.err
+    assert not Path("run/result.json").exists()
+
+
+def test_double_precision_trains_and_resumes(memcomp_train: Run) -> None:
+    arguments = ("sampler=cd", *FAST, "hydra.run.dir=run", "trainer.precision=64-true")
+    assert memcomp_train(*arguments).status == 0
+    assert torch.load("run/weights/finetune.pt", weights_only=True)["0.rbms.0.weight"].dtype == torch.float64
+    Path("run/result.json").unlink()
+    assert memcomp_train(*arguments).status == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"abc", b"PK", bytes([128])], ids=["empty", "text", "zip", "pickle"])
+def test_any_damaged_weight_file_is_named(memcomp_train: Run, content: bytes) -> None:
+    Path("damaged.pt").write_bytes(content)
+    outcome = memcomp_train("model.weights=damaged.pt")
+    assert outcome.status == 2
+    assert "checkpoint damaged.pt" in outcome.err
 
 
 def test_finished_run_is_not_repeated(memcomp_train: Run) -> None:

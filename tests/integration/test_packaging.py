@@ -45,10 +45,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel unpacked in a folder that comes before the checkout on the path."""
+    """The wheel installed, without its dependencies, in a folder that comes before the checkout on the path."""
     folder = tmp_path_factory.mktemp("installed")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder)
+    run(sys.executable, "-m", "pip", "install", "--no-deps", "--target", str(folder), str(wheel), folder=folder)
     return folder
 
 
@@ -66,16 +65,13 @@ def test_wheel_holds_every_config_and_the_type_marker(wheel: Path) -> None:
 
 def test_command_line_from_the_wheel(installed: Path, tmp_path: Path) -> None:
     out = run(
-        sys.executable,
-        "-c",
-        "import memcomp_lightning as m; from memcomp_lightning.cli.train import main; print(m.__file__); main()",
+        str(installed / "bin" / "memcomp-train"),
         "sampler=cd",
         "pretrain.iterations=1",
         "finetune.iterations=1",
         folder=tmp_path,
         path=installed,
     )
-    assert str(installed) in out
     assert "test accuracy" in out
 
 

@@ -25,7 +25,7 @@ def test_two_processes_give_the_update_of_one(start_process: Start, tmp_path: Pa
     one = start_process(*RUN, "hydra.run.dir=one")
     _, err = one.communicate()
     assert one.returncode == 0, err
-    two = start_process(*RUN, "hydra.run.dir=two", "trainer.devices=2", "trainer.strategy=ddp")
+    two = start_process(*RUN, "hydra.run.dir=two", "trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300")
     out, err = two.communicate(timeout=200)
     assert two.returncode == 0, err
     for stage in ("pretrain", "finetune"):
@@ -51,6 +51,8 @@ from memcomp_lightning.data import Digits, ImageDataModule
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNPretraining
 from memcomp_lightning.samplers import PCD
+from memcomp_lightning import rng
+from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 def fit(epochs, resume=None):
     module = DBNPretraining(DBN(32, [5]), PCD(n_chains=7), iterations=4)
@@ -61,6 +63,28 @@ def fit(epochs, resume=None):
     trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     return module, trainer
 
+class OwnAnswer:
+    """A shared sampler whose answer differs between calls and processes, so that only sharing makes them agree."""
+    uses_data, shared, calls = False, True, 0
+    def init(self, model, n_chains, *, generator):
+        return NoState()
+    def sample(self, model, state, positive, *, generator):
+        OwnAnswer.calls += 1
+        n = torch.distributed.get_rank() + 2
+        v = rng.bernoulli(torch.full((n, model.n_visible), 0.5), generator=generator)
+        return NegativePhase(Configurations(v, model.hidden_mean(v).detach()), state, {})
+
+def fit_shared():
+    module = DBNPretraining(DBN(32, [5]), OwnAnswer(), iterations=3)
+    trainer = pl.Trainer(max_epochs=3, devices=2, strategy="ddp", accelerator="cpu", logger=False,
+                         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)
+    trainer.fit(module, datamodule=ImageDataModule(Digits().load(), batch_size=None, chunk_size=300))
+    calls = [None, None]
+    torch.distributed.all_gather_object(calls, OwnAnswer.calls)
+    if trainer.is_global_zero:
+        print("calls of a shared sampler:", calls)
+
+fit_shared()
 fit(2)
 whole, _ = fit(4)
 resumed, trainer = fit(4, "ckpt/to2.ckpt")
@@ -82,4 +106,5 @@ if trainer.is_global_zero:
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr
+    assert "calls of a shared sampler: [3, 0]" in done.stdout, "one answer an update serves both processes"
     assert "resumed to the same bits: True own chains: True own streams: True" in done.stdout

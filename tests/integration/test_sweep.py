@@ -80,6 +80,17 @@ def test_batch_size_and_model_can_be_swept(memcomp_train: Run) -> None:
     ]
 
 
+def test_paths_among_the_overrides_and_unfinished_jobs(memcomp_train: Run) -> None:
+    assert memcomp_train("sampler=cd", *FAST, "hydra.run.dir=first").status == 0
+    sweep = ["-m", "sampler=cd,pcd", *FAST, "model.weights=first/weights/pretrain.pt", "hydra.sweep.dir=sweep"]
+    assert memcomp_train(*sweep).status == 0
+    assert len(rows("sweep/table.csv")) == 2
+    (Path("sweep") / "killed job").mkdir()
+    outcome = memcomp_train(*sweep)
+    assert outcome.status == 1
+    assert "killed job\n    did not finish" in outcome.out
+
+
 def test_joblib_launcher_gives_the_same_results(memcomp_train: Run) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     assert memcomp_train(*SWEEP).status == 0

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from memcomp_lightning.dmm.base import HasVoltage, Recording, VectorField
 from memcomp_lightning.dmm.integrate import Integrator
-from memcomp_lightning.qubo.maxsat import WeightedMaxSat
 from memcomp_lightning.qubo.qubo import Qubo, Trajectory
 
 MachineT = TypeVar("MachineT")
@@ -31,15 +30,18 @@ class Run(NamedTuple):
 def run(
     field: VectorField[MachineT, StateT],
     integrator: Integrator,
-    maxsat: WeightedMaxSat,
-    qubo: Qubo,
+    machine: MachineT,
     state: StateT,
+    qubo: Qubo,
     *,
+    offset: Tensor,
     n_steps: int,
     recording: Recording | None,
 ) -> Run:
-    """Integrate for ``n_steps`` steps and keep the best assignment that the voltages pass through."""
-    machine = field.build(maxsat)
+    """Integrate for ``n_steps`` steps and keep the best assignment that the voltages pass through.
+
+    ``offset`` is the energy at which all clauses are satisfied, ``(*problems,)``.
+    """
     exact = qubo.double()
     best = state.voltage > 0
     best_energy = exact.energy(best)
@@ -57,7 +59,7 @@ def run(
         best_energy = torch.minimum(energy, best_energy)
         found_at = torch.where(better, step, found_at)
         if recording is not None and step % recording.every == 0:
-            unsatisfied = energy - maxsat.offset.unsqueeze(-1)
+            unsatisfied = energy - offset.unsqueeze(-1)
             records.append((time, unsatisfied, x, time - recorded_until))
             recorded_until = time
     trajectory = None
