@@ -76,7 +76,7 @@ def build(config: DictConfig) -> Plan:
     seed = config.seed
     require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
     images = _load(instantiate(config.data.source))
-    network, initial = _network(config, images)
+    network = _network(config, images)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = None
@@ -101,8 +101,9 @@ def build(config: DictConfig) -> Plan:
         classifier: Classifier
         if isinstance(network, DBN):
             generator = rng.stream(seed, "output weights")
+            output_init = instantiate(config.model.get("output_init"))
             classifier = DBNClassifier(
-                network, n_classes=images.n_classes, output_init=initial, generator=generator, **settings
+                network, n_classes=images.n_classes, output_init=output_init, generator=generator, **settings
             )
         else:
             classifier = Classifier(network, **settings)
@@ -117,11 +118,11 @@ def build(config: DictConfig) -> Plan:
     return plan
 
 
-def _network(config: DictConfig, images: ImageData) -> tuple[nn.Module, Any]:
-    """The network and its initialiser."""
+def _network(config: DictConfig, images: ImageData) -> nn.Module:
     settings = OmegaConf.to_container(config.model, resolve=True)
     assert isinstance(settings, dict)
     weights = settings.pop("weights", None)
+    settings.pop("output_init", None)
     partitions = config.data.partitions
     require_count("data.partitions", partitions)
     arguments: dict[str, Any] = {
@@ -140,7 +141,7 @@ def _network(config: DictConfig, images: ImageData) -> tuple[nn.Module, Any]:
         require(isinstance(weights, str), "model.weights", weights, "the path of a weight file, or null")
         load_weights(network, Path(weights))
     network.to(_PRECISIONS.get(str(config.trainer.precision), torch.float32))
-    return network, factory.keywords.get("weight_init")
+    return network
 
 
 def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:

@@ -132,7 +132,7 @@ class ImageDataModule(LightningDataModule):
         allowed = f"at most the {n} training images"
         require(partitions <= n, "partitions", partitions, allowed)
         require_count("partition_seed", partition_seed, minimum=0)
-        in_range = 0 <= validation_fraction < 1
+        in_range = isinstance(validation_fraction, int | float) and 0 <= validation_fraction < 1
         require(in_range, "validation_fraction", validation_fraction, "a number in [0, 1)")
         n_part = n // partitions
         n_held_out = round(validation_fraction * n_part)

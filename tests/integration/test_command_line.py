@@ -89,7 +89,7 @@ REFUSED = {
     "callbacks.pretrain.momentum_schedule.initial=2": ["momentum initial = 2", "[0, 1)"],
     "+keep=1": ["setting = 'keep'", "'pretrain'"],
     "+pretrain.lr=1": ["setting pretrain = 'lr'", "'optimizer'"],
-    "data.validation_fraction=abc": ["abc"],
+    "data.validation_fraction=abc": ["validation_fraction = 'abc'", "a number in [0, 1)"],
     "pretrain.optimizer.lr=nan": ["pretrain.optimizer.lr = nan", "a finite number"],
     "finetune.optimizer._target_=torch.optim.Adam": ["'Adam'", "callbacks.pretrain.momentum_schedule=null"],
     "+trainer.max_epochs=3": ["trainer.max_epochs = 3", "each stage sets it"],

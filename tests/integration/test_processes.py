@@ -25,7 +25,8 @@ def test_two_processes_give_the_update_of_one(start_process: Start, tmp_path: Pa
     one = start_process(*RUN, "hydra.run.dir=one")
     _, err = one.communicate()
     assert one.returncode == 0, err
-    two = start_process(*RUN, "hydra.run.dir=two", "trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300")
+    distributed = ["trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300"]
+    two = start_process(*RUN, "hydra.run.dir=two", *distributed)
     out, err = two.communicate(timeout=200)
     assert two.returncode == 0, err
     for stage in ("pretrain", "finetune"):
@@ -64,7 +65,7 @@ def fit(epochs, resume=None):
     return module, trainer
 
 class OwnAnswer:
-    """A shared sampler whose answer differs between calls and processes, so that only sharing makes them agree."""
+    # Its answers differ in number between processes: only sharing makes them agree.
     uses_data, shared, calls = False, True, 0
     def init(self, model, n_chains, *, generator):
         return NoState()
