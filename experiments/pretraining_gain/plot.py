@@ -16,7 +16,11 @@ import matplotlib.pyplot as plt
 
 from memcomp_lightning.cli.table import mean_and_error
 
-LABELS = {"cd": "CD-1", "pcd": "PCD-1, 100 chains", "dmm_qubo": "ground state of the DMM"}
+STYLES = {
+    "cd": {"label": "CD-1", "marker": "s", "markersize": 10, "fillstyle": "none"},
+    "pcd": {"label": "PCD-1, 100 chains", "marker": "x"},
+    "dmm_qubo": {"label": "ground state of the DMM", "marker": "o"},
+}
 
 
 def main() -> None:
@@ -33,7 +37,7 @@ def main() -> None:
     figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     for sampler, points in curves.items():
         iterations, means, errors = zip(*sorted(points), strict=True)
-        axes.errorbar(iterations, means, errors, marker="o", capsize=3, label=LABELS.get(sampler, sampler))
+        axes.errorbar(iterations, means, errors, capsize=3, **STYLES.get(sampler, {"label": sampler}))
     for style, control in zip(("--", ":", "-."), arguments.control, strict=False):
         label, _, folder = control.partition("=")
         accuracies = json.loads((Path(folder) / "result.json").read_text())["test_accuracy"]
