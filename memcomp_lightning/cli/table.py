@@ -1,6 +1,8 @@
 """Results as short tables."""
 
 import math
+import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -49,5 +51,12 @@ def run_table(result: dict[str, Any]) -> str:
 
 
 def closing_lines(folder: Path) -> str:
-    """Where the run is and how to look at it."""
-    return f"\nRun folder:   {folder}\nTensorBoard:  tensorboard --logdir {folder}"
+    """Where the run is and how to look at it; the command works in a virtual environment that is not active."""
+    beside_python = Path(sys.executable).parent / "tensorboard"
+    command = "tensorboard" if shutil.which("tensorboard") else short_path(beside_python)
+    return f"\nRun folder:   {folder}\nTensorBoard:  {command} --logdir '{folder}'"
+
+
+def short_path(path: Path) -> Path:
+    """The path as a person in the current folder would type it."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

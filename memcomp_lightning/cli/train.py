@@ -18,7 +18,7 @@ from memcomp_lightning.cli import pipeline, sweep
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import closing_lines, run_table
+from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.modules import CheckpointError
 
@@ -61,11 +61,11 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
         try:
             result = pipeline.run(plan, config, folder, _by_name(overrides))
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
-            raise KeyboardInterrupt(f"Go on with: memcomp-train resume={_short(folder.path)}") from stop
+            raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
     else:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
-        print(f"\n{run_table(result)}\n{closing_lines(_short(folder.path))}", flush=True)
+        print(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}", flush=True)
 
 
 def _is_first_process() -> bool:
@@ -76,11 +76,6 @@ def _is_first_process() -> bool:
 def _by_name(overrides: list[str]) -> dict[str, str]:
     pairs = (override.partition("=") for override in overrides)
     return {name: value for name, _, value in pairs}
-
-
-def _short(path: Path) -> Path:
-    """The path as a person at this folder would type it."""
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _resumed(arguments: list[str]) -> list[str]:
@@ -120,12 +115,12 @@ def main() -> None:
     except KeyboardInterrupt as interrupt:
         how = str(interrupt)
         if sweep.RememberSweepFolder.folder is not None:
-            how = f"Go on with the same command and hydra.sweep.dir={_short(sweep.RememberSweepFolder.folder)}"
+            how = f"Go on with the same command and hydra.sweep.dir={short_path(sweep.RememberSweepFolder.folder)}"
         print(f"\nmemcomp-train: interrupted. {how}".rstrip(), file=sys.stderr)
         sys.exit(130)
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
-        print(f"\n{table}\n{closing_lines(_short(folder))}", flush=True)
+        print(f"\n{table}\n{closing_lines(short_path(folder))}", flush=True)
         sys.exit(1 if n_failed else 0)
 
 

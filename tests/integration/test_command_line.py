@@ -23,7 +23,7 @@ def test_every_sampler_trains(memcomp_train: Run, sampler: str) -> None:
     outcome = memcomp_train(f"sampler={sampler}", *FAST, "solver.n_restarts=3", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     assert "pretrain layer 2" in outcome.out
-    assert "tensorboard --logdir run" in outcome.out
+    assert "tensorboard --logdir 'run'" in outcome.out
     result = json.loads(Path("run/result.json").read_text())
     assert len(result["stages"]["pretrain"]["energy_gap"]) == 2
     assert 0 <= result["test_accuracy"][0] <= 1
