@@ -1,15 +1,18 @@
 """What the callbacks ask of a LightningModule, and how they log.
 
-Two small protocols; a module that trains an energy model offers both:
+A module that trains an energy model offers both of these:
 
 * ``training_step`` returns a dictionary with ``positive`` and ``negative`` (:class:`Configurations`),
   ``contrast`` ``(*replicas,)`` and ``info`` (diagnostics of the sampler); ``validation_step`` returns one
   with ``v``, the visible states of held-out images.
 * Attributes: ``rbm``, the model in training.
 
+A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.modules.Score`) in the
+dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
+
 Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
 epoch), ``progress`` (text of the progress bar), ``images_of(v)`` (inputs that visible states stand for),
-``active_optimizer``.
+``dbn`` and ``layer`` (the stack that ``rbm`` is part of, for receptive fields), ``active_optimizer``.
 """
 
 from abc import ABC, abstractmethod
@@ -32,6 +35,20 @@ def prefix_of(module: pl.LightningModule) -> str:
 def iteration_of(module: pl.LightningModule) -> int:
     """Passes done over the training set in the module's present stage and layer."""
     return int(getattr(module, "iteration", module.current_epoch))
+
+
+def rbm_of(module: pl.LightningModule) -> Any:
+    """The energy model in training.
+
+    Raises:
+        TypeError: The module has no attribute ``rbm``.
+    """
+    if not hasattr(module, "rbm"):
+        raise TypeError(
+            f"{type(module).__name__} has no attribute 'rbm', the energy model in training, which this callback "
+            "looks at; see memcomp_lightning.callbacks.base for the protocol."
+        )
+    return module.rbm
 
 
 def log_scalars(module: pl.LightningModule, values: Mapping[str, Tensor | float]) -> None:

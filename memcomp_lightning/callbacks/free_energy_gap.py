@@ -6,7 +6,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from memcomp_lightning.callbacks.base import log_scalars, required
+from memcomp_lightning.callbacks.base import log_scalars, rbm_of, required
 from memcomp_lightning.errors import require_count
 
 
@@ -70,6 +70,5 @@ class FreeEnergyGap(pl.Callback):
 
 @torch.no_grad()
 def _free_energy(module: pl.LightningModule, v: Tensor) -> Tensor:
-    rbm: Any = module.rbm
-    free_energy: Tensor = rbm.free_energy(v)
+    free_energy: Tensor = rbm_of(module).free_energy(v)
     return free_energy

@@ -5,15 +5,23 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, prefix_of, required, tensorboards
+from memcomp_lightning.callbacks.base import (
+    EveryIterations,
+    log_scalars,
+    prefix_of,
+    rbm_of,
+    required,
+    tensorboards,
+)
 
 
 class NegativePhaseEnergies(EveryIterations):
     """Logs energies of both phases, their contrast, the sampler's diagnostics, and an energy histogram.
 
-    Scalars ``energy_data``, ``energy_model``, ``energy_model_lowest`` and ``contrast`` = energy_data -
-    energy_model, ``negative_phase/<key>`` for each diagnostic; histograms ``energies_data`` and
-    ``energies_model`` in TensorBoard.
+    ``contrast`` is the loss of the pass's last update, before its step, and ``negative_phase/<key>`` are the
+    sampler's diagnostics then. ``energy_data``, ``energy_model`` and ``energy_model_lowest``, and the histograms
+    ``energies_data`` and ``energies_model`` in TensorBoard, are energies of the same states under the updated
+    model.
 
     Args:
         every: Passes between two values, >= 1.
@@ -21,7 +29,7 @@ class NegativePhaseEnergies(EveryIterations):
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Energies of the last batch of the pass."""
-        rbm: Any = pl_module.rbm
+        rbm = rbm_of(pl_module)
         positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
         energies = rbm.energy(negative.v, negative.h)
         data_energies = rbm.energy(positive.v, positive.h)

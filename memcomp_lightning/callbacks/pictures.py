@@ -8,7 +8,7 @@ import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, tensorboards
+from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, tensorboards
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.samplers.gibbs import random_visible, sweep
@@ -72,8 +72,7 @@ class ReceptiveFields(Pictures):
 
     def tiles(self, pl_module: pl.LightningModule) -> Tensor:
         """Weights of the layer in training times those below."""
-        rbm: Any = pl_module.rbm
-        fields: Tensor = rbm.weight
+        fields: Tensor = rbm_of(pl_module).weight
         dbn: Any = getattr(pl_module, "dbn", None)
         layer: Any = getattr(pl_module, "layer", 0)
         layers_below = range(layer) if dbn is not None else ()
@@ -102,7 +101,7 @@ class ModelSamples(Pictures):
 
     def tiles(self, pl_module: pl.LightningModule) -> Tensor:
         """Run the chains and project them down to the inputs."""
-        rbm: Any = pl_module.rbm
+        rbm = rbm_of(pl_module)
         generator = rng.stream(self.seed, "evaluation")
         v = random_visible(rbm, self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, required
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, rbm_of, required
 
 
 class ReconstructionError(EveryIterations):
@@ -20,6 +20,6 @@ class ReconstructionError(EveryIterations):
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Reconstruct the last batch of the pass."""
         v = required(outputs, "positive", self).v
-        rbm: Any = pl_module.rbm
+        rbm = rbm_of(pl_module)
         error = (v - rbm.visible_mean(rbm.hidden_mean(v))).square().mean((-1, -2))
         log_scalars(pl_module, {"reconstruction_error": error})

@@ -20,7 +20,7 @@ from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.modules import CheckpointError
+from memcomp_lightning.modules import CheckpointError, DivergedError
 
 USAGE_ERROR = 2
 """Exit status when a setting is refused."""
@@ -38,7 +38,7 @@ def train(config: DictConfig) -> None:
     try:
         _train(config, folder, list(settings.overrides.task))
     except Exception as error:
-        if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError)):
+        if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(error)
         if not in_sweep:
             raise

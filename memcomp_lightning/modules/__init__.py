@@ -4,7 +4,7 @@ from memcomp_lightning.modules.baseline import BaselineClassifier
 from memcomp_lightning.modules.classifier import Classifier, Score, evaluate, score
 from memcomp_lightning.modules.finetuning import DBNClassifier
 from memcomp_lightning.modules.pretraining import DBNPretraining
-from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
+from memcomp_lightning.modules.stage import DivergedError, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import CheckpointError, load_weights, save_weights
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Classifier",
     "DBNClassifier",
     "DBNPretraining",
+    "DivergedError",
     "OptimizerFactory",
     "Score",
     "StageModule",

@@ -17,6 +17,14 @@ from memcomp_lightning import rng
 OptimizerFactory = Callable[[Iterable[Parameter]], Optimizer]
 """Builds an optimiser for some parameters: ``functools.partial(torch.optim.SGD, lr=0.1)``."""
 
+LARGEST_WEIGHT = 1e15
+"""A parameter beyond this, or not finite, means that training diverged."""
+
+
+class DivergedError(ValueError):
+    """Training left the finite numbers; which tensor, where, and what to do."""
+
+
 PAPER_SGD: OptimizerFactory = partial(SGD, lr=0.1)
 """Learning rate of Manukian et al. 2019; its momentum comes from the MomentumSchedule callback."""
 
@@ -97,6 +105,18 @@ class StageModule(pl.LightningModule):
             optimizer = optimizers[optimizer_index] if isinstance(optimizers, list) else optimizers
             optimizer.step()
             optimizer.zero_grad()
+            if self.trainer.is_last_batch:
+                self._check_finite()
+
+    def _check_finite(self) -> None:
+        """Stop before the pass's checkpoint is written, so that the last good one stays."""
+        for name, parameter in self.named_parameters():
+            largest = float(parameter.detach().abs().max())
+            if not largest <= LARGEST_WEIGHT:
+                raise DivergedError(
+                    f"{self.progress}: training diverged, {name} has an entry of {largest:g}. Lower the learning "
+                    f"rate ({self.stage}.optimizer.lr) and start a new run."
+                )
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Parameters that the present loss does not depend on."""

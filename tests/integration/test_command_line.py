@@ -159,6 +159,15 @@ def test_a_stage_cut_short_is_not_recorded(memcomp_train: Run) -> None:
     assert not Path("run/result.json").exists()
 
 
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_divergence_ends_with_its_cause(memcomp_train: Run, stage: str) -> None:
+    outcome = memcomp_train("sampler=cd", *FAST, f"{stage}.optimizer.lr=1e30", "hydra.run.dir=run")
+    assert outcome.status == 2
+    assert "training diverged" in outcome.err
+    assert f"{stage}.optimizer.lr" in outcome.err
+    assert not Path("run/result.json").exists()
+
+
 def test_double_precision_trains_and_resumes(memcomp_train: Run) -> None:
     arguments = ("sampler=cd", *FAST, "hydra.run.dir=run", "trainer.precision=64-true")
     assert memcomp_train(*arguments).status == 0

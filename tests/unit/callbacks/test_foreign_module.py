@@ -24,6 +24,7 @@ from memcomp_lightning.callbacks import (
     ReconstructionError,
     StageProgressBar,
 )
+from memcomp_lightning.callbacks.base import rbm_of
 from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.models import RBM, Gaussian
 from memcomp_lightning.modules import Score
@@ -175,6 +176,11 @@ def test_callbacks_change_no_bit_of_training(tmp_path: Path) -> None:
 def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> None:
     _, trainer = fit(tmp_path, [MomentumSchedule(0.1, 0.7, switch_at=2)], False)
     assert trainer.optimizers[0].param_groups[0]["momentum"] == 0.7
+
+
+def test_a_module_without_an_rbm_is_told_so() -> None:
+    with pytest.raises(TypeError, match="LightningModule has no attribute 'rbm'.*protocol"):
+        rbm_of(pl.LightningModule())
 
 
 @pytest.mark.parametrize(("callback", "missing"), [(ReconstructionError(), "positive"), (FreeEnergyGap(), "v")])
