@@ -179,7 +179,7 @@ def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> 
 
 
 def test_a_module_without_an_rbm_is_told_so() -> None:
-    with pytest.raises(TypeError, match="LightningModule has no attribute 'rbm'.*protocol"):
+    with pytest.raises(TypeError, match=r"LightningModule has no attribute 'rbm'.*protocol"):
         rbm_of(pl.LightningModule())
 
 
