@@ -43,6 +43,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
+@pytest.mark.xdist_group("resume")  # one worker, one uninterrupted run
 @pytest.mark.parametrize(
     ("stage", "epoch"), [("pretrain", 3), ("pretrain", 22), ("finetune", 4)], ids=["layer1", "layer2", "finetune"]
 )

@@ -93,9 +93,10 @@ def test_paths_among_the_overrides_and_unfinished_jobs(memcomp_train: Run) -> No
 
 def test_joblib_launcher_gives_the_same_results(memcomp_train: Run) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    assert memcomp_train(*SWEEP).status == 0
-    parallel = [argument if "sweep.dir" not in argument else "hydra.sweep.dir=parallel" for argument in SWEEP]
-    outcome = memcomp_train(*parallel, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+    sweep = ["-m", "sampler=cd", "seed=0,1", *FAST]
+    assert memcomp_train(*sweep, "hydra.sweep.dir=sweep").status == 0
+    parallel = ["hydra.sweep.dir=parallel", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    outcome = memcomp_train(*sweep, *parallel)
     assert outcome.status == 0, outcome.err
     for row, other in zip(rows("sweep/table.csv"), rows("parallel/table.csv"), strict=True):
         assert row["test_accuracy_mean"] == other["test_accuracy_mean"]
