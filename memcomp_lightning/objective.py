@@ -32,13 +32,13 @@ def contrast(
         positive: Configurations with the data clamped.
         negative: Configurations that stand for the model's own distribution.
     """
-    weight = torch.cat((_shares(positive), -_shares(negative)), dim=-1)
+    weight = torch.cat((shares(positive), -shares(negative)), dim=-1)
     v = torch.cat((positive.v, negative.v), dim=-2)
     h = torch.cat((positive.h, negative.h), dim=-2)
     return model.total_energy(v, h, weight)
 
 
-def _shares(configurations: Configurations) -> Tensor:
+def shares(configurations: Configurations) -> Tensor:
     """Weights that add up to one, ``(*replicas, n)``."""
     v, _, weight = configurations
     if weight is None:

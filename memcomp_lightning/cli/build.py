@@ -81,21 +81,23 @@ def build(config: DictConfig) -> Plan:
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = None
     if isinstance(network, DBN) and config.pretrain.iterations > 0:
+        callbacks = _callbacks(config, "pretrain")
         pretraining = Stage(
             DBNPretraining(
                 network,
                 instantiate(config.sampler),
                 iterations=config.pretrain.iterations,
-                optimizer=_optimizer(config, "pretrain"),
+                optimizer=_optimizer(config, "pretrain", callbacks),
                 seed=seed,
             ),
             _data(config, "pretrain", images),
-            _callbacks(config, "pretrain"),
+            callbacks,
         )
     if config.finetune.iterations > 0:
+        callbacks = _callbacks(config, "finetune")
         settings: dict[str, Any] = {
             "iterations": config.finetune.iterations,
-            "optimizer": _optimizer(config, "finetune"),
+            "optimizer": _optimizer(config, "finetune", callbacks),
             "seed": seed,
         }
         classifier: Classifier
@@ -107,7 +109,7 @@ def build(config: DictConfig) -> Plan:
             )
         else:
             classifier = Classifier(network, **settings)
-        finetuning = Stage(classifier, _data(config, "finetune", images), _callbacks(config, "finetune"))
+        finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
     plan = Plan(network, pretraining, finetuning)
     require(
         bool(plan.stages),
@@ -158,12 +160,12 @@ def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
         raise UserError(f"{stage}, data: {error}") from error
 
 
-def _optimizer(config: DictConfig, stage: str) -> OptimizerFactory:
+def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> OptimizerFactory:
     """The optimiser's factory, tried on one parameter so that bad settings show before training."""
     factory: OptimizerFactory = instantiate(config[stage].optimizer)
     try:
         optimizer = factory([nn.Parameter(torch.zeros(1))])
-        for callback in _callbacks(config, stage):
+        for callback in callbacks:
             if isinstance(callback, MomentumSchedule):
                 callback.check(optimizer)
     except (TypeError, ValueError) as error:

@@ -13,16 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning import __version__
 from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.modules.weights import written_whole
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a file so that an interruption leaves the old one or the new one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from torch.linalg import vecdot
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
 
@@ -80,10 +81,7 @@ class RBM(nn.Module):
 
     def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
         """Mean of E over configurations, by their weights."""
-        v, h, weight = configurations
-        if weight is None:
-            weight = torch.ones(v.shape[:-1], dtype=v.dtype, device=v.device)
-        return self.total_energy(v, h, weight / weight.sum(-1, keepdim=True))
+        return self.total_energy(configurations.v, configurations.h, shares(configurations))
 
     def total_energy(
         self,

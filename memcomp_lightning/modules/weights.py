@@ -1,6 +1,8 @@
 """Weight files: written whole or not at all, read without executing code, refused with the cause."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +32,21 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         _write(checkpoint, Path(path))
 
 
-def _write(content: Any, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a file beside ``path`` to write; rename it on success, so that an interruption leaves the old one."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        torch.save(content, partial)
+        yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _write(content: Any, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as partial:
+        torch.save(content, partial)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

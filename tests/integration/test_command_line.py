@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import FAST, Outcome
+from running import FAST, Outcome
 
 import memcomp_lightning
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import launch
+from running import launch
 
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [

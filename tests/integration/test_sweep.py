@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import FAST, Outcome
+from running import FAST, Outcome
 
 from memcomp_lightning.cli import pipeline
 
