@@ -4,13 +4,14 @@ from memcomp_lightning.qubo.alternating_descent import AlternatingDescent
 from memcomp_lightning.qubo.brute_force import BruteForce
 from memcomp_lightning.qubo.from_model import from_model
 from memcomp_lightning.qubo.graph import Bipartite, EdgeList, Graph
-from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo, to_qubo
+from memcomp_lightning.qubo.maxsat import Clauses, WeightedMaxSat, from_qubo, to_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, QuboSolver, Status, Trajectory
 
 __all__ = [
     "AlternatingDescent",
     "Bipartite",
     "BruteForce",
+    "Clauses",
     "EdgeList",
     "Graph",
     "Qubo",

@@ -1,20 +1,42 @@
-"""Weighted MAX-SAT with clauses of two literals and unit clauses, and its exact equivalence with QUBO."""
+"""Weighted MAX-SAT: clauses of any length, and the exact equivalence of its two-literal form with QUBO."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from memcomp_lightning.qubo.graph import Graph
+from memcomp_lightning.errors import require
+from memcomp_lightning.qubo.graph import EdgeList, Graph
 from memcomp_lightning.qubo.qubo import Qubo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clauses:
+    """Clauses of one length, three literals or more.
+
+    Attributes:
+        variables: ``(n_clauses, length)`` int64, the variables of a clause differ.
+        polarity: ``(n_clauses, length)``, +1 for a variable, -1 for its negation.
+        weight: Clause weights >= 0, ``(*problems, n_clauses)``.
+    """
+
+    variables: Tensor
+    polarity: Tensor
+    weight: Tensor
+
+    def unsatisfied_weight(self, x: Tensor) -> Tensor:
+        """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, of states in {0, 1}."""
+        false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
+        return (false.all(-1).double() @ self.weight.double().unsqueeze(-1)).squeeze(-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeightedMaxSat:
     r"""Minimise the total weight of unsatisfied clauses.
 
-    One clause a pair of the graph, ``(first literal or second literal)``, and one unit clause a variable. A
-    literal is the variable (polarity +1) or its negation (polarity -1).
+    One clause a pair of the graph, ``(first literal or second literal)``, one unit clause a variable, and
+    longer clauses. A literal is the variable (polarity +1) or its negation (polarity -1).
 
     Attributes:
         graph: The pairs of variables that share a clause.
@@ -22,7 +44,8 @@ class WeightedMaxSat:
         first: Polarity of the first literal, +1 or -1, broadcastable to ``weight``.
         second: Polarity of the second literal, likewise.
         unit: Signed weights of the unit clauses, ``(*problems, n)``: > 0 asks for x = 1, < 0 for x = 0.
-        offset: ``(*problems,)``; unsatisfied weight + offset is the energy of the QUBO.
+        offset: ``(*problems,)`` float64; unsatisfied weight + offset is the energy.
+        longer: Clauses of three literals and more, one entry a length.
     """
 
     graph: Graph
@@ -31,6 +54,21 @@ class WeightedMaxSat:
     second: Tensor
     unit: Tensor
     offset: Tensor
+    longer: tuple[Clauses, ...] = ()
+
+    @property
+    def n(self) -> int:
+        """Number of variables."""
+        return self.graph.n
+
+    @property
+    def problems(self) -> tuple[int, ...]:
+        """Leading axes of independent problems."""
+        return tuple(self.offset.shape)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Unsatisfied weight + offset in float64, ``(*problems, n_states)``, of ``x (*problems, n_states, n)``."""
+        return self.unsatisfied_weight(x) + self.offset.double().unsqueeze(-1)
 
     def unsatisfied_weight(self, x: Tensor) -> Tensor:
         """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, by its definition.
@@ -48,7 +86,60 @@ class WeightedMaxSat:
         clauses = (self.weight.double().unsqueeze(over_states) * false[0] * false[1]).sum(axes)
         unit = self.unit.double().unsqueeze(-2)
         units = (unit.abs() * ((x > 0.5) != (unit > 0))).sum(-1)
-        return clauses + units
+        return clauses + units + sum(block.unsatisfied_weight(x) for block in self.longer)
+
+    @staticmethod
+    def from_clauses(
+        n: int, clauses: Sequence[Sequence[int]], weights: Sequence[float], offset: float = 0.0
+    ) -> "WeightedMaxSat":
+        """Return one problem from literals as in DIMACS: 3 is variable number 3 (the first is 1), -3 its negation.
+
+        The energy is the unsatisfied weight of the clauses as given, plus ``offset``. Repeated literals count
+        once, clauses with a literal and its negation are always satisfied and left out, empty clauses and
+        opposite unit clauses add to the offset.
+
+        Args:
+            n: Number of variables, >= 1.
+            clauses: One list of literals a clause.
+            weights: One weight >= 0 a clause.
+            offset: Added to every energy.
+
+        >>> problem = WeightedMaxSat.from_clauses(3, [[1, 2], [-1], [-1, -2, 3]], [1.0, 2.0, 4.0])
+        >>> problem.energy(torch.tensor([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])).tolist()
+        [6.0, 0.0]
+        """
+        require(len(clauses) == len(weights), "number of weights", len(weights), f"{len(clauses)}, one a clause")
+        by_length: dict[int, tuple[list[list[int]], list[float]]] = {}
+        for number, (clause, weight) in enumerate(zip(clauses, weights, strict=True), start=1):
+            require(weight >= 0, f"weight of clause {number}", weight, "a number >= 0")
+            literals = sorted(set(clause), key=abs)
+            outside = [literal for literal in literals if not 1 <= abs(literal) <= n]
+            require(not outside, f"literals of clause {number}", clause, f"integers of size 1 to n = {n}")
+            if not any(-literal in literals for literal in literals):
+                lists = by_length.setdefault(len(literals), ([], []))
+                lists[0].append(literals)
+                lists[1].append(float(weight))
+        wanted = torch.zeros(2, n, dtype=torch.float64)  # total unit weight for x = 0 and for x = 1
+        for (literal,), weight in zip(*by_length.pop(1, ([], [])), strict=True):
+            wanted[int(literal > 0), abs(literal) - 1] += weight
+        always = sum(by_length.pop(0, ([], []))[1]) + float(wanted.min(0).values.sum())
+        pairs = _literal_block(2, *by_length.pop(2, ([], [])))
+        return WeightedMaxSat(
+            graph=EdgeList(n=n, pairs=pairs.variables),
+            weight=pairs.weight,
+            first=pairs.polarity[:, 0],
+            second=pairs.polarity[:, 1],
+            unit=(wanted[1] - wanted[0]).to(pairs.weight.dtype),
+            offset=torch.tensor(offset + always, dtype=torch.float64),
+            longer=tuple(_literal_block(length, *by_length[length]) for length in sorted(by_length)),
+        )
+
+
+def _literal_block(length: int, clauses: list[list[int]], weights: list[float]) -> Clauses:
+    """Clauses of one length as tensors."""
+    literals = torch.tensor(clauses, dtype=torch.int64).reshape(len(clauses), length)
+    weight = torch.tensor(weights, dtype=torch.get_default_dtype())
+    return Clauses(variables=literals.abs() - 1, polarity=literals.sign().to(weight.dtype), weight=weight)
 
 
 def from_qubo(qubo: Qubo) -> WeightedMaxSat:
@@ -76,7 +167,17 @@ def to_qubo(maxsat: WeightedMaxSat) -> Qubo:
     """Return the QUBO whose energy is unsatisfied weight + offset, for every x; inverse of :func:`from_qubo`.
 
     A literal of polarity q is false as (1 + q) / 2 - q x; a clause costs the product of two of these.
+
+    Raises:
+        SettingError: The problem has clauses of three literals or more.
     """
+    require(
+        not maxsat.longer,
+        "longest clause",
+        max((block.variables.shape[-1] for block in maxsat.longer), default=2),
+        "at most 2 literals",
+        "Longer clauses are no QUBO without auxiliary variables: solve them with DmmSolver(field=ClauseField()).",
+    )
     axes = tuple(range(-len(maxsat.graph.edge_shape), 0))
     constant_first, constant_second = (1 + maxsat.first) / 2, (1 + maxsat.second) / 2
     linear = maxsat.graph.scatter(

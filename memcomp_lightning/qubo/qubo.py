@@ -79,6 +79,7 @@ class Qubo:
 
         Args:
             matrix: ``(*problems, n, n)``; entries (i, j) and (j, i) add up, the diagonal is the linear part.
+                One problem may also be a sparse torch tensor (COO, CSR, CSC).
             offset: ``(*problems,)``; None is zero.
 
         >>> Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]])).energy(torch.ones(1, 2)).tolist()
@@ -91,14 +92,48 @@ class Qubo:
             tuple(matrix.shape),
             "(*problems, n, n)",
         )
-        pairs = torch.triu_indices(n, n, offset=1, device=matrix.device).T
-        coupling = matrix[..., pairs[:, 0], pairs[:, 1]] + matrix[..., pairs[:, 1], pairs[:, 0]]
-        used = (coupling != 0).flatten(0, -2).any(0) if coupling.ndim > 1 else coupling != 0
+        if matrix.layout != torch.strided:
+            require(matrix.ndim == 2, "sparse matrix shape", tuple(matrix.shape), "(n, n), one problem")
+            coo = matrix.to_sparse_coo().coalesce()
+            return Qubo.from_coo(n, coo.indices()[0], coo.indices()[1], coo.values(), offset)
+        used = (matrix != 0).reshape(-1, n, n).any(0)
+        rows, columns = used.nonzero(as_tuple=True)
+        return Qubo.from_coo(n, rows, columns, matrix[..., rows, columns], offset)
+
+    @staticmethod
+    def from_coo(n: int, rows: Tensor, columns: Tensor, values: Tensor, offset: Tensor | None = None) -> "Qubo":
+        """Return the problem ``sum_k value_k x_row_k x_column_k + offset`` with memory linear in the entries.
+
+        Args:
+            n: Number of variables, >= 1.
+            rows: ``(n_entries,)`` int64 in [0, n).
+            columns: ``(n_entries,)`` int64 in [0, n); where it equals the row the entry is linear.
+            values: ``(*problems, n_entries)``; entries of the same pair, in either order, add up.
+            offset: ``(*problems,)``; None is zero.
+
+        >>> edges = torch.tensor([0, 1, 1]), torch.tensor([1, 0, 1])
+        >>> Qubo.from_coo(2, *edges, torch.tensor([-1.0, -2.0, 1.0])).energy(torch.ones(1, 2)).tolist()
+        [-2.0]
+        """
+        for name, index in (("rows", rows), ("columns", columns)):
+            require(
+                index.shape == values.shape[-1:] and bool(((index >= 0) & (index < n)).all()),
+                name,
+                f"shape {tuple(index.shape)}, from {index.min() if index.numel() else '-'} "
+                f"to {index.max() if index.numel() else '-'}",
+                f"{values.shape[-1]} integers, one a value, from 0 to n - 1 = {n - 1}",
+            )
+        diagonal = rows == columns
+        problems = values.shape[:-1]
+        linear = values.new_zeros(*problems, n).index_add_(-1, rows[diagonal], values[..., diagonal])
+        first, second = torch.minimum(rows, columns)[~diagonal], torch.maximum(rows, columns)[~diagonal]
+        keys, position = (first * n + second).unique(return_inverse=True)
+        coupling = values.new_zeros(*problems, keys.shape[0]).index_add_(-1, position, values[..., ~diagonal])
         return Qubo(
-            graph=EdgeList(n=n, pairs=pairs[used]),
-            coupling=coupling[..., used],
-            linear=matrix.diagonal(dim1=-2, dim2=-1).clone(),
-            offset=matrix.new_zeros(matrix.shape[:-2]) if offset is None else offset,
+            graph=EdgeList(n=n, pairs=torch.stack((keys // n, keys % n), dim=-1)),
+            coupling=coupling,
+            linear=linear,
+            offset=values.new_zeros(problems) if offset is None else offset,
         )
 
     def to_matrix(self) -> Tensor:
