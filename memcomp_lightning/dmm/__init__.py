@@ -1,8 +1,23 @@
 """Digital memcomputing machines: vector fields, integrators, kernels and the solver."""
 
 from memcomp_lightning.dmm.base import Recording, VectorField
+from memcomp_lightning.dmm.bond import BondField
 from memcomp_lightning.dmm.clause import ClauseField
-from memcomp_lightning.dmm.integrate import AdaptiveEuler, Integrator
-from memcomp_lightning.dmm.solver import DmmSolver
+from memcomp_lightning.dmm.integrate import AdaptiveEuler, ExactShortTerm, Heun, Integrator, Splitting, Strang
+from memcomp_lightning.dmm.solver import DmmSolver, WarmRestart, default_steps
 
-__all__ = ["AdaptiveEuler", "ClauseField", "DmmSolver", "Integrator", "Recording", "VectorField"]
+__all__ = [
+    "AdaptiveEuler",
+    "BondField",
+    "ClauseField",
+    "DmmSolver",
+    "ExactShortTerm",
+    "Heun",
+    "Integrator",
+    "Recording",
+    "Splitting",
+    "Strang",
+    "VectorField",
+    "WarmRestart",
+    "default_steps",
+]

@@ -1,10 +1,14 @@
-"""What a memory dynamics is: parameters of a problem, a state, its time derivative, its bounds."""
+"""What a memory dynamics is: a problem in its units, a state, the time derivative, the bounds."""
 
-from typing import NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from torch import Generator, Tensor
+from torch import Tensor
 
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat
+from memcomp_lightning.qubo.qubo import Qubo
+
+if TYPE_CHECKING:
+    from memcomp_lightning.dmm.integrate import Integrator
 
 MachineT = TypeVar("MachineT")
 StateT = TypeVar("StateT", bound="HasVoltage")
@@ -22,15 +26,31 @@ class HasVoltage(Protocol):
 class VectorField(Protocol[MachineT, StateT]):
     """One family of memory dynamics. Pure: settings are frozen, the state goes in and comes out.
 
-    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple.
+    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple of tensors,
+    of which those named ``...long_term`` outlive a warm restart and have their rest value at 1.
     """
 
-    def build(self, maxsat: WeightedMaxSat) -> MachineT:
+    @property
+    def integrator(self) -> "Integrator":
+        """The scheme that the constants were chosen with."""
+        ...
+
+    @property
+    def noise(self) -> float:
+        """Width of the uniform noise on the voltages per square root of machine time, >= 0."""
+        ...
+
+    @property
+    def spread(self) -> float:
+        """Initial voltages are uniform in [-spread, spread], in (0, 1]."""
+        ...
+
+    def build(self, problem: Qubo | WeightedMaxSat) -> MachineT:
         """Scale a problem into the machine's units."""
         ...
 
-    def init(self, machine: MachineT, n_restarts: int, *, generator: Generator) -> StateT:
-        """Draw independent initial conditions."""
+    def init(self, machine: MachineT, voltage: Tensor) -> StateT:
+        """The memories that belong to initial voltages ``(*problems, n_restarts, n)``."""
         ...
 
     def derivative(self, machine: MachineT, state: StateT) -> StateT:

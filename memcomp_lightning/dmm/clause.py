@@ -1,25 +1,28 @@
 """Clause dynamics: every clause of a weighted MAX-SAT has a short- and a long-term memory.
 
 Sources: [B] Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), the 3-SAT form, eqs. 2 to 6. Its weighted
-two-literal form as in public research code of the same group. Constants: a random search on 32x32 and
-64x64 RBMs, see docs/dmm.md.
+two-literal form as in public research code of the same group. Constants: docs/dmm.md.
 """
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from memcomp_lightning import rng
+from memcomp_lightning.dmm.integrate import Integrator, Splitting
+from memcomp_lightning.dmm.scaling import by_largest, coupling_norm, decisive, expand
 from memcomp_lightning.errors import require
 from memcomp_lightning.qubo.graph import Graph
-from memcomp_lightning.qubo.maxsat import WeightedMaxSat
+from memcomp_lightning.qubo.maxsat import Clauses, WeightedMaxSat, from_qubo
+from memcomp_lightning.qubo.qubo import Qubo
 
 
 class ClauseMachine(NamedTuple):
-    """A problem in the machine's units; per-clause tensors have an axis of size 1 for the restarts."""
+    """A problem in the machine's units; per-clause tensors have an axis of size 1 for the restarts.
+
+    Clauses of three literals and more are padded to the longest one with polarity 0.
+    """
 
     graph: Graph
     weight: Tensor
@@ -27,44 +30,52 @@ class ClauseMachine(NamedTuple):
     second: Tensor
     unit: Tensor
     unit_sign: Tensor
+    longer_variables: Tensor
+    longer_polarity: Tensor
+    longer_weight: Tensor
 
 
 class ClauseState(NamedTuple):
-    """Voltages ``(*problems, n_restarts, n)``, memories of clauses and of unit clauses."""
+    """Voltages ``(*problems, n_restarts, n)``, memories of pairs, of unit clauses and of longer clauses."""
 
     voltage: Tensor
     short_term: Tensor
     long_term: Tensor
     unit_long_term: Tensor
+    longer_short_term: Tensor
+    longer_long_term: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClauseField:
     r"""The vector field of the clause dynamics.
 
-    With literal polarity q, voltage v in [-1, 1], clause weight w and the clause's unsatisfaction
-    ``C = 1/2 min(1 - q_i v_i, 1 - q_j v_j)``:
+    With literal polarity q, voltage v in [-1, 1], clause weight w, the falsehood f_i = 1/2 (1 - q_i v_i) of a
+    literal and the clause's unsatisfaction ``C = min_i f_i``:
 
     .. math::
         \dot v_i &= \sum_m w_m [x_l x_s G_i + (1 + \zeta x_l)(1 - x_s) R_i] + \rho u_i y_i \\
+        G_i &= q_i \min_{j \ne i} f_j, \qquad R_i = q_i C \text{ where } f_i = C \text{, else } 0 \\
         \dot x_s &= \beta (x_s + \epsilon)(C - \gamma), \quad x_s \in [0, 1] \\
         \dot x_l &= \alpha (C - \delta) \cdot (x_l - 1 \text{ if } C < \delta \text{ else } 1),
                     \quad x_l \in [1, x_{max}]
 
-    Deviation: no noise on the voltages; it hardly mattered in the search for the constants.
-
-    Weights are divided by ``rms(w) sqrt(longest layer or largest degree)``, so that the drive of a voltage
-    does not depend on the problem's scale and size.
+    and y, the long-term memory of a unit clause of signed weight u, like x_l. Weights are divided by
+    :func:`~memcomp_lightning.dmm.scaling.coupling_norm`, so that the drive of a voltage does not depend on the
+    problem's units, size and degrees.
 
     Attributes:
         alpha: Rate of the long-term memory, > 0.
         beta: Rate of the short-term memory, > 0.
         gamma: Threshold of the short-term memory, in (0, 1/2).
-        delta: Threshold of the long-term memory, in (0, gamma).
+        delta: Threshold of the long-term memory, in (0, gamma].
         epsilon: Keeps the short-term memory from sticking at 0, > 0.
         zeta: Share of the long-term memory in the rigidity, >= 0.
-        long_term_max: Upper bound of the long-term memories, > 1.
+        long_term_max: Upper bound of the long-term memories, >= 1; 1 freezes them.
         unit_pull: rho, strength of the unit clauses, > 0.
+        noise: Width of the uniform noise on the voltages per square root of machine time, >= 0.
+        spread: Initial voltages are uniform in [-spread, spread], in (0, 1].
+        integrator: The scheme that the constants were chosen with.
     """
 
     alpha: float = 7.6
@@ -75,59 +86,69 @@ class ClauseField:
     zeta: float = 0.040
     long_term_max: float = 3.3
     unit_pull: float = 0.99
+    noise: float = 0.0
+    spread: float = 1.0
+    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=2.35, dt_min=0.0126, dt_max=2.8))
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "epsilon", "unit_pull"):
             require(getattr(self, name) > 0, name, getattr(self, name), "a number > 0")
         require(0 < self.gamma < 0.5, "gamma", self.gamma, "a number in (0, 1/2)")
-        require(0 < self.delta < self.gamma, "delta", self.delta, f"a number in (0, gamma = {self.gamma})")
-        require(self.zeta >= 0, "zeta", self.zeta, "a number >= 0")
-        require(self.long_term_max > 1, "long_term_max", self.long_term_max, "a number > 1")
+        require(0 < self.delta <= self.gamma, "delta", self.delta, f"a number in (0, gamma = {self.gamma}]")
+        for name in ("zeta", "noise"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a number >= 0")
+        require(self.long_term_max >= 1, "long_term_max", self.long_term_max, "a number >= 1")
+        require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
 
-    def build(self, maxsat: WeightedMaxSat) -> ClauseMachine:
-        """Divide the weights by their scale; a problem without couplings is scaled by its unit clauses."""
-        axes = tuple(range(-len(maxsat.graph.edge_shape), 0))
-        n_clauses = math.prod(maxsat.graph.edge_shape)
-        # Scaled by the maximum first: squares of 1e-30 or 1e30 leave the range of float32.
-        largest = torch.maximum(_amax(maxsat.weight, axes), maxsat.unit.abs().amax(-1))
-        largest = torch.where(largest > 0, largest, torch.ones_like(largest))
-        weight = maxsat.weight / _expand(largest, len(axes))
-        unit = maxsat.unit / largest.unsqueeze(-1)
-        degree = maxsat.graph.scatter(torch.ones_like(weight), torch.ones_like(weight)).amax(-1)
-        rms = (weight.square().sum(axes) / max(n_clauses, 1)).sqrt() * degree.clamp(min=1).sqrt()
-        scale = torch.where(rms > _SMALLEST_RATIO, rms, torch.ones_like(rms))
+    def build(self, problem: Qubo | WeightedMaxSat) -> ClauseMachine:
+        """Write a QUBO as MAX-SAT and divide the weights by their scale."""
+        maxsat = problem if isinstance(problem, WeightedMaxSat) else from_qubo(problem)
+        n_axes = len(maxsat.graph.edge_shape)
+        longer = _padded(maxsat)
+        # Longer clauses stand behind the pairs while the scale is found.
+        n_pairs = maxsat.weight[0].numel() if maxsat.problems else maxsat.weight.numel()
+        flat = torch.cat((maxsat.weight.reshape(*maxsat.problems, n_pairs), longer.weight), dim=-1)
+        flat, unit = by_largest(flat, maxsat.unit, 1)
+        weight = flat[..., :n_pairs].reshape(maxsat.weight.shape)
+        longer_weight = flat[..., n_pairs:]
+        scale = coupling_norm(maxsat.graph, weight) if n_pairs else _clause_norm(longer, longer_weight)
+        weight, unit = weight / expand(scale, n_axes), unit / scale.unsqueeze(-1)
+        if not maxsat.longer:
+            unit = decisive(maxsat.graph, weight, unit)
         return ClauseMachine(
             graph=maxsat.graph,
-            weight=(weight / _expand(scale, len(axes))).unsqueeze(-1 - len(axes)),
-            first=maxsat.first.unsqueeze(-1 - len(axes)),
-            second=maxsat.second.unsqueeze(-1 - len(axes)),
-            unit=(unit / scale.unsqueeze(-1)).unsqueeze(-2),
+            weight=weight.unsqueeze(-1 - n_axes),
+            first=maxsat.first.unsqueeze(-1 - n_axes),
+            second=maxsat.second.unsqueeze(-1 - n_axes),
+            unit=unit.unsqueeze(-2),
             unit_sign=unit.sign().unsqueeze(-2),
+            longer_variables=longer.variables,
+            longer_polarity=longer.polarity,
+            longer_weight=(longer_weight / scale.unsqueeze(-1)).unsqueeze(-2),
         )
 
-    def init(self, machine: ClauseMachine, n_restarts: int, *, generator: Generator) -> ClauseState:
-        """Voltages uniform in [-1, 1], x_s(0) = C(0), long-term memories at 1 ([B], methods)."""
-        problems, n = machine.unit.shape[:-2], machine.unit.shape[-1]
-        draw = rng.uniform((*problems, n_restarts, n), generator=generator, like=machine.unit)
-        voltage = 2 * draw - 1
+    def init(self, machine: ClauseMachine, voltage: Tensor) -> ClauseState:
+        """x_s(0) = C(0), long-term memories at 1 ([B], methods)."""
         unsatisfied, _, _ = _unsatisfaction(machine, voltage)
+        longer = _falsehood(machine, voltage).amin(-1) if machine.longer_weight.numel() else _none(machine, voltage)
         return ClauseState(
             voltage=voltage,
             short_term=unsatisfied,
             long_term=torch.ones_like(unsatisfied),
             unit_long_term=torch.ones_like(voltage),
+            longer_short_term=longer,
+            longer_long_term=torch.ones_like(longer),
         )
 
     def derivative(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
         """Right-hand side; each line names its equation."""
-        voltage, short_term, long_term, unit_long_term = state
+        voltage = state.voltage
         # [B] eq. 3: C = 1/2 min_i (1 - q_i v_i).
         unsatisfied, false_first, false_second = _unsatisfaction(machine, voltage)
-        # [B] eq. 4: G_i = 1/2 q_i (1 - q_j v_j): each literal is pushed by how false the other one is.
-        gradient = machine.weight * long_term * short_term
-        # [B] eq. 5: R_i = 1/2 (q_i - v_i) = q_i C where i attains the minimum, else 0.
-        # Deviation: a tie goes to the first literal alone.
-        rigidity = machine.weight * (1 + self.zeta * long_term) * (1 - short_term) * unsatisfied
+        # [B] eq. 4: each literal is pushed by how false the other one is.
+        gradient = machine.weight * state.long_term * state.short_term
+        # [B] eq. 5. Deviation: a tie goes to the first literal alone.
+        rigidity = machine.weight * (1 + self.zeta * state.long_term) * (1 - state.short_term) * unsatisfied
         rigidity_first = rigidity * (false_first <= false_second)
         # [B] eq. 2, one sum for each end of the clauses.
         drive = machine.graph.scatter(
@@ -135,20 +156,57 @@ class ClauseField:
             machine.second * torch.addcmul(rigidity - rigidity_first, gradient, false_first),
         )
         # Deviation: unit clauses pull with a long-term memory of their own, not as two equal literals.
-        unit_unsatisfied = 0.5 * (1 - machine.unit_sign * voltage)
-        drive = drive + self.unit_pull * machine.unit * unit_long_term
+        drive = drive + self.unit_pull * machine.unit * state.unit_long_term
+        longer_unsatisfied = state.longer_short_term
+        if machine.longer_weight.numel():
+            longer_drive, longer_unsatisfied = self._longer(machine, state)
+            drive = drive + longer_drive
         return ClauseState(
             voltage=drive,
-            # [B] eq. 6.
-            short_term=self.beta * (short_term + self.epsilon) * (unsatisfied - self.gamma),
-            long_term=self._long_term_rate(unsatisfied, long_term),
-            unit_long_term=self._long_term_rate(unit_unsatisfied, unit_long_term),
+            short_term=self._short_term_rate(unsatisfied, state.short_term),
+            long_term=self._long_term_rate(unsatisfied, state.long_term),
+            unit_long_term=self._long_term_rate(
+                0.5 * (1 - machine.unit_sign * voltage), state.unit_long_term
+            ),
+            longer_short_term=self._short_term_rate(longer_unsatisfied, state.longer_short_term),
+            longer_long_term=self._long_term_rate(longer_unsatisfied, state.longer_long_term),
         )
+
+    def _longer(self, machine: ClauseMachine, state: ClauseState) -> tuple[Tensor, Tensor]:
+        """Drive and C of the clauses of three literals and more: the same equations, [B] eqs. 2 to 5."""
+        false = _falsehood(machine, state.voltage)
+        (smallest, next_smallest), at = false.topk(2, largest=False).values.unbind(-1), false.argmin(-1)
+        is_smallest = torch.nn.functional.one_hot(at, false.shape[-1]).bool()
+        others = torch.where(is_smallest, next_smallest.unsqueeze(-1), smallest.unsqueeze(-1))
+        gradient = machine.longer_weight * state.longer_long_term * state.longer_short_term
+        rigidity = (
+            machine.longer_weight * (1 + self.zeta * state.longer_long_term) * (1 - state.longer_short_term) * smallest
+        )
+        push = machine.longer_polarity * (gradient.unsqueeze(-1) * others + rigidity.unsqueeze(-1) * is_smallest)
+        drive = torch.zeros_like(state.voltage)
+        drive.index_add_(-1, machine.longer_variables.flatten(), push.flatten(-2))
+        return drive, smallest
+
+    def _short_term_rate(self, unsatisfied: Tensor, short_term: Tensor) -> Tensor:
+        """[B] eq. 6."""
+        return self.beta * (short_term + self.epsilon) * (unsatisfied - self.gamma)
 
     def _long_term_rate(self, unsatisfied: Tensor, long_term: Tensor) -> Tensor:
         """[B] eq. 7. Deviations: no factor (1 + w), and below delta the decay towards 1 is exponential."""
         excess = unsatisfied - self.delta
         return self.alpha * torch.addcmul(excess.clamp(min=0), excess.clamp(max=0), long_term - 1)
+
+    def short_term_after(self, machine: ClauseMachine, state: ClauseState, dt: Tensor) -> dict[str, Tensor]:
+        """x_s after ``dt`` at frozen voltages: ``(x_s + eps) exp(beta (C - gamma) dt) - eps``."""
+        unsatisfied, _, _ = _unsatisfaction(machine, state.voltage)
+        after = {"short_term": (state.short_term, unsatisfied)}
+        if machine.longer_weight.numel():
+            after["longer_short_term"] = (state.longer_short_term, _falsehood(machine, state.voltage).amin(-1))
+        return {
+            name: (x + self.epsilon) * (self.beta * (c - self.gamma) * expand(dt, c.ndim - dt.ndim)).exp()
+            - self.epsilon
+            for name, (x, c) in after.items()
+        }
 
     def bound(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
         """V in [-1, 1], x_s in [0, 1], long-term memories in [1, long_term_max]."""
@@ -157,26 +215,54 @@ class ClauseField:
             short_term=state.short_term.clamp(0, 1),
             long_term=state.long_term.clamp(1, self.long_term_max),
             unit_long_term=state.unit_long_term.clamp(1, self.long_term_max),
+            longer_short_term=state.longer_short_term.clamp(0, 1),
+            longer_long_term=state.longer_long_term.clamp(1, self.long_term_max),
         )
 
 
-_SMALLEST_RATIO = 1e-12
-"""Couplings this much smaller than the largest unit clause do not set the scale."""
-
-
 def _unsatisfaction(machine: ClauseMachine, voltage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """C of each clause, and how false each of its two literals is: 1/2 (1 - q v)."""
+    """C of each pair, and how false each of its two literals is: 1/2 (1 - q v)."""
     first, second = machine.graph.gather(voltage)
     false_first = 0.5 - 0.5 * machine.first * first
     false_second = 0.5 - 0.5 * machine.second * second
     return torch.minimum(false_first, false_second), false_first, false_second
 
 
-def _expand(x: Tensor, n_axes: int) -> Tensor:
-    """Append axes of size 1."""
-    return x.reshape(*x.shape, *(1,) * n_axes)
+def _falsehood(machine: ClauseMachine, voltage: Tensor) -> Tensor:
+    """How false each literal of the longer clauses is; 1 for a padded one, which is never the smallest."""
+    false = 0.5 - 0.5 * machine.longer_polarity * voltage[..., machine.longer_variables]
+    return torch.where(machine.longer_polarity == 0, 1.0, false)
 
 
-def _amax(x: Tensor, axes: tuple[int, ...]) -> Tensor:
-    """Maximum over the last axes, 0 where they are empty."""
-    return x.amax(axes) if math.prod(x.shape[axes[0] :]) else x.sum(axes)
+def _none(machine: ClauseMachine, voltage: Tensor) -> Tensor:
+    """Memories of no clause."""
+    return voltage.new_zeros(*voltage.shape[:-1], 0)
+
+
+def _padded(maxsat: WeightedMaxSat) -> Clauses:
+    """All longer clauses as one block, padded with variable 0 at polarity 0."""
+    length = max((block.variables.shape[-1] for block in maxsat.longer), default=3)
+    blocks = maxsat.longer or (
+        Clauses(
+            variables=torch.zeros(0, length, dtype=torch.int64, device=maxsat.unit.device),
+            polarity=maxsat.unit.new_zeros(0, length),
+            weight=maxsat.unit.new_zeros(*maxsat.problems, 0),
+        ),
+    )
+    missing = [length - block.variables.shape[-1] for block in blocks]
+    pad = torch.nn.functional.pad
+    return Clauses(
+        variables=torch.cat([pad(b.variables, (0, k)) for b, k in zip(blocks, missing, strict=True)]),
+        polarity=torch.cat([pad(b.polarity, (0, k)) for b, k in zip(blocks, missing, strict=True)]),
+        weight=torch.cat([block.weight for block in blocks], dim=-1),
+    )
+
+
+def _clause_norm(clauses: Clauses, weight: Tensor) -> Tensor:
+    """The scale where there are no pairs: root mean square over the variables of their clauses' weights."""
+    n = int(clauses.variables.max()) + 1 if clauses.variables.numel() else 1
+    power = weight.new_zeros(*weight.shape[:-1], n)
+    per_literal = weight.square().unsqueeze(-1) * (clauses.polarity != 0)
+    power.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))
+    norm = (power.sum(-1) / (power > 0).sum(-1).clamp(min=1)).sqrt()
+    return torch.where(norm > 0, norm, torch.ones_like(norm))

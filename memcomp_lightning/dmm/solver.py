@@ -1,39 +1,70 @@
-"""The digital memcomputing machine as a QUBO solver: restarts, stopping rule, readout."""
+"""The digital memcomputing machine as a solver of QUBO and weighted MAX-SAT."""
 
 import dataclasses
+import importlib.util
+import logging
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 import torch
 from torch import Generator, Tensor
 
+from memcomp_lightning import rng
 from memcomp_lightning.dmm.base import Recording, VectorField
+from memcomp_lightning.dmm.bond import BondField
 from memcomp_lightning.dmm.clause import ClauseField
-from memcomp_lightning.dmm.integrate import AdaptiveEuler, Integrator
+from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.kernels import reference
-from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.qubo.maxsat import from_qubo
+from memcomp_lightning.dmm.kernels.run import Run, Start
+from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status, Trajectory
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WarmRestart:
+    """A restart that goes on from where the last one of its row ended.
+
+    Attributes:
+        keep: Share of the long-term memory that is kept, in [0, 1].
+        spread: Width of the uniform kick on the final voltages, in (0, 2]; 2 forgets them.
+    """
+
+    keep: float = 0.5
+    spread: float = 0.5
+
+    def __post_init__(self) -> None:
+        require(0 <= self.keep <= 1, "keep", self.keep, "a number in [0, 1]")
+        require(0 < self.spread <= 2, "spread", self.spread, "a number in (0, 2]")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DmmSolver:
     """Integrate a memory dynamics from random initial conditions and keep the best assignment met.
 
-    QUBO -> weighted MAX-SAT -> ODE -> assignment (Manukian et al. 2019, Fig. 3). Restarts run side by side
-    in one tensor program, ``patience`` of them at a time; the rule is the paper's, checked after each such
-    group: stop once ``patience`` restarts have passed without a better assignment.
+    QUBO -> weighted MAX-SAT -> ODE -> assignment (Manukian et al. 2019, Fig. 3). Restarts run side by side,
+    ``patience`` of them at a time; the rule is the paper's, checked after each such group: stop once
+    ``patience`` restarts have passed without a better assignment.
 
     Attributes:
         field: The vector field.
-        integrator: The scheme of one step.
+        integrator: The scheme of one step; None takes the one that the field's constants were chosen with.
         n_restarts: Most restarts a problem, >= 1 (the paper: 28).
         patience: Restarts without a better assignment after which a problem is done, 1 to n_restarts; None
             runs all restarts at once.
-        max_steps: Integration steps a restart, >= 1.
+        max_steps: Integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
+        quench_every: Each so many steps a copy of the digital state descends by single flips, and counts if it
+            ends lower; the machine does not feel it. None reads the voltages alone.
+        warm: How later groups begin; None draws new voltages with memories at rest.
         record: Records trajectories, for the time average and for plots; None does not.
+        kernel: "compiled" for the CPU, "reference" in plain torch for any device, field and integrator, or
+            "auto": compiled where it can be.
 
     >>> from memcomp_lightning import rng
     >>> qubo = Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))
@@ -42,108 +73,196 @@ class DmmSolver:
     """
 
     field: VectorField[Any, Any] = dataclasses.field(default_factory=ClauseField)
-    integrator: Integrator = dataclasses.field(default_factory=AdaptiveEuler)
+    integrator: Integrator | None = None
     n_restarts: int = 28
     patience: int | None = None
-    max_steps: int = 300
+    max_steps: int | None = None
+    quench_every: int | None = 2
+    warm: WarmRestart | None = None
     record: Recording | None = None
+    kernel: Literal["auto", "compiled", "reference"] = "auto"
 
     def __post_init__(self) -> None:
         require_count("n_restarts", self.n_restarts)
-        require_count("max_steps", self.max_steps)
+        for name in ("max_steps", "patience", "quench_every"):
+            if getattr(self, name) is not None:
+                require_count(name, getattr(self, name))
         if self.patience is not None:
-            require_count("patience", self.patience)
             require(
                 self.patience <= self.n_restarts,
                 "patience",
                 self.patience,
                 f"an integer from 1 to n_restarts = {self.n_restarts}, or null",
             )
+        if self.warm is not None:
+            require(
+                self.patience is not None and self.n_restarts % self.patience == 0,
+                "warm",
+                self.warm,
+                f"used with a patience that divides n_restarts = {self.n_restarts}",
+                f"Set patience (now {self.patience}): so many restarts run at a time, later ones go on from them.",
+            )
         if self.record is not None:
             require_count("record.every", self.record.every)
-            require(
-                self.record.every <= self.max_steps,
-                "record.every",
-                self.record.every,
-                f"an integer from 1 to max_steps = {self.max_steps}",
-            )
+            if self.max_steps is not None:
+                require(
+                    self.record.every <= self.max_steps,
+                    "record.every",
+                    self.record.every,
+                    f"an integer from 1 to max_steps = {self.max_steps}",
+                )
+        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
+        if self.kernel == "compiled":
+            obstacle = self._obstacle("cpu")
+            require(obstacle is None, "kernel", self.kernel, "'auto' or 'reference' here", obstacle or "")
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
-        """Return the best assignment of each restart."""
+    def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: Generator) -> QuboSolution:
+        """Return the best assignment of each restart.
+
+        Args:
+            problem: One or many problems of one shape, ``(*problems, ...)``.
+            generator: For the initial voltages and the noise.
+        """
         begin = time.perf_counter()
-        flat = _flatten(qubo)
-        n_problems = flat.problems[0]
-        device = flat.linear.device
-        best = flat.linear.new_zeros(n_problems, self.n_restarts, qubo.n)
+        flat = _flatten(problem)
+        n_problems, n, device = flat.offset.shape[0], flat.n, flat.offset.device
+        n_steps = self.max_steps or default_steps(problem)
+        group_size = self.patience or self.n_restarts
+        best = torch.zeros(n_problems, self.n_restarts, n, dtype=torch.bool, device=device)
+        energies = torch.full((n_problems, self.n_restarts), torch.inf, dtype=torch.float64, device=device)
         found_at = torch.zeros(n_problems, self.n_restarts, dtype=torch.int64, device=device)
-        was_run = torch.zeros(n_problems, self.n_restarts, dtype=torch.bool, device=device)
-        trajectories: list[tuple[Tensor, slice, Trajectory]] = []
+        visited: list[tuple[Tensor, slice, Trajectory]] = []
         active = torch.arange(n_problems, device=device)
-        lowest = torch.full((n_problems,), torch.inf, dtype=torch.float64, device=device)
         lowest_at = torch.zeros(n_problems, dtype=torch.int64, device=device)
-        done = 0
-        while done < self.n_restarts and active.numel():
-            group = slice(done, min(done + (self.patience or self.n_restarts), self.n_restarts))
-            run = self._run(_select(flat, active), group.stop - group.start, generator)
-            best[active, group] = run.best
-            found_at[active, group] = run.found_at
-            was_run[active, group] = True
-            if run.trajectory is not None:
-                trajectories.append((active, group, run.trajectory))
-            done = group.stop
-            if self.patience is not None:
-                energy, index = _select(flat, active).energy(run.best).min(-1)
-                better = energy < lowest[active]
-                lowest_at[active] = torch.where(better, group.start + index, lowest_at[active])
-                lowest[active] = torch.minimum(energy, lowest[active])
-                active = active[done - 1 - lowest_at[active] < self.patience]
-        energies = flat.energy(best).masked_fill(~was_run, torch.inf)
-        status = torch.where(found_at > 0.9 * self.max_steps, Status.STILL_IMPROVING, Status.STEP_BUDGET)
+        before: Run | None = None
+        for done in range(0, self.n_restarts, group_size):
+            group = slice(done, min(done + group_size, self.n_restarts))
+            part = flat if len(active) == n_problems else _select(flat, active)
+            start = self._start(part, group.stop - group.start, before, generator)
+            run = self._run(part, start, n_steps)
+            found = part.energy(run.best)
+            lowest, at = found.min(-1)
+            better = lowest < energies[active].amin(-1)
+            lowest_at[active] = torch.where(better, done + at, lowest_at[active])
+            best[active, group], energies[active, group], found_at[active, group] = run.best, found, run.found_at
+            if run.visited is not None:
+                visited.append((active, group, _trajectory(part, run.visited.time, run.visited.states)))
+            going_on = group.stop - 1 - lowest_at[active] < group_size
+            active = active[going_on]
+            if not active.numel():
+                break
+            if self.warm is not None:
+                before = run._replace(voltage=run.voltage[going_on], kept=tuple(m[going_on] for m in run.kept))
+        was_run = energies.isfinite()
+        status = torch.where(found_at > 0.9 * n_steps, Status.STILL_IMPROVING, Status.STEP_BUDGET)
         status = status.masked_fill(~was_run, Status.NOT_RUN)
-        shape = (*qubo.problems, self.n_restarts)
+        shape = (*problem.problems, self.n_restarts)
+        dtype = problem.linear.dtype if isinstance(problem, Qubo) else problem.unit.dtype
         return QuboSolution(
-            assignments=best.reshape(*shape, qubo.n),
+            assignments=best.to(dtype).reshape(*shape, n),
             energies=energies.reshape(shape),
             status=status.reshape(shape),
-            steps=(was_run * self.max_steps).reshape(shape),
+            steps=(was_run * n_steps).reshape(shape),
             wall_time_s=time.perf_counter() - begin,
-            trajectory=_join(trajectories, n_problems, self.n_restarts, qubo.problems),
+            trajectory=_join(visited, n_problems, self.n_restarts, problem.problems),
         )
 
-    def _run(self, qubo: Qubo, n_restarts: int, generator: Generator) -> reference.Run:
-        maxsat = from_qubo(qubo)
-        machine = self.field.build(maxsat)
-        return reference.run(
+    def _start(
+        self, problem: Qubo | WeightedMaxSat, n_restarts: int, before: Run | None, generator: Generator
+    ) -> Start:
+        """New voltages with memories at rest, or a kick to where the last restarts ended."""
+        like = problem.linear if isinstance(problem, Qubo) else problem.unit
+        shape = (problem.offset.shape[0], n_restarts)
+        kick = 2 * rng.uniform((*shape, problem.n), generator=generator, like=like) - 1
+        seed = torch.randint(2**32, shape, generator=generator, device=generator.device).to(like.device)
+        if self.warm is None or before is None:
+            return Start(self.field.spread * kick, (), seed)
+        voltage = (before.voltage.to(like.dtype) + self.warm.spread * kick).clamp(-1, 1)
+        return Start(voltage, tuple(self.warm.keep * memory for memory in before.kept), seed)
+
+    def _run(self, problem: Qubo | WeightedMaxSat, start: Start, n_steps: int) -> Run:
+        """Run the kernel that the settings ask for."""
+        integrator = self.integrator or self.field.integrator
+        obstacle = None if self.kernel == "reference" else self._obstacle(start.voltage.device.type)
+        if self.kernel == "reference" or obstacle is not None:
+            if obstacle is not None:
+                _say_once(obstacle)
+            kernel = reference.run
+        else:
+            from memcomp_lightning.dmm.kernels import cpu
+
+            kernel = cpu.run
+        return kernel(
             self.field,
-            self.integrator,
-            machine,
-            self.field.init(machine, n_restarts, generator=generator),
-            qubo,
-            offset=maxsat.offset,
-            n_steps=self.max_steps,
+            integrator,  # type: ignore[arg-type]
+            problem,
+            start,
+            n_steps=n_steps,
+            quench_every=self.quench_every,
             recording=self.record,
         )
 
+    def _obstacle(self, device: str) -> str | None:
+        """Why the compiled kernel cannot run, and what to do; None if it can."""
+        integrator = self.integrator or self.field.integrator
+        if type(self.field) not in (ClauseField, BondField):
+            return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
+        if type(integrator) is not Splitting:
+            return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
+        if device != "cpu":
+            return f"The problem is on {device}: the plain torch kernel runs there."
+        if importlib.util.find_spec("numba") is None:
+            return "numba is not installed: the plain torch kernel is many times slower. pip install numba"
+        return None
 
-def _flatten(qubo: Qubo) -> Qubo:
+
+def default_steps(problem: Qubo | WeightedMaxSat) -> int:
+    """Steps a restart, by the rule ``50 sqrt(n)`` of the number of variables, at least 200."""
+    return max(200, round(50 * math.sqrt(problem.n)))
+
+
+@cache
+def _say_once(message: str) -> None:
+    log.info(message)
+
+
+def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> Qubo | WeightedMaxSat:
+    """Apply a change of the axes of problems to all tensors that have them."""
+    if isinstance(problem, Qubo):
+        return dataclasses.replace(
+            problem,
+            coupling=change(problem.coupling),
+            linear=change(problem.linear),
+            offset=change(problem.offset),
+        )
+    return dataclasses.replace(
+        problem,
+        weight=change(problem.weight),
+        first=change(problem.first.expand(problem.weight.shape)),
+        second=change(problem.second.expand(problem.weight.shape)),
+        unit=change(problem.unit),
+        offset=change(problem.offset),
+        longer=tuple(dataclasses.replace(block, weight=change(block.weight)) for block in problem.longer),
+    )
+
+
+def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
     """All problems on one leading axis."""
-    n_problems = math.prod(qubo.problems)
-    return Qubo(
-        graph=qubo.graph,
-        coupling=qubo.coupling.reshape(n_problems, *qubo.graph.edge_shape),
-        linear=qubo.linear.reshape(n_problems, qubo.n),
-        offset=qubo.offset.reshape(-1),
-    )
+    n_problems, axes = math.prod(problem.problems), len(problem.problems)
+    return _map(problem, lambda x: x.reshape(n_problems, *x.shape[axes:]))
 
 
-def _select(qubo: Qubo, problems: Tensor) -> Qubo:
+def _select(problem: Qubo | WeightedMaxSat, chosen: Tensor) -> Qubo | WeightedMaxSat:
     """Some of the problems on the leading axis."""
-    return Qubo(
-        graph=qubo.graph,
-        coupling=qubo.coupling[problems],
-        linear=qubo.linear[problems],
-        offset=qubo.offset[problems],
-    )
+    return _map(problem, lambda x: x[chosen])
+
+
+def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -> Trajectory:
+    """Add what the records weigh, from their states in float64, and how long each one stands."""
+    energies = problem.energy(states.flatten(1, 2)).reshape(times.shape)
+    offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
+    dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
+    return Trajectory(times, energies - offset[:, None, None], states, dwell)
 
 
 def _join(

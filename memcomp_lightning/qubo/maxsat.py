@@ -1,7 +1,7 @@
 """Weighted MAX-SAT: clauses of any length, and the exact equivalence of its two-literal form with QUBO."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +29,15 @@ class Clauses:
         """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, of states in {0, 1}."""
         false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
         return (false.all(-1).double() @ self.weight.double().unsqueeze(-1)).squeeze(-1)
+
+    def field(self, x: Tensor) -> Tensor:
+        """Unsatisfied weight of x_i = 1 less that of x_i = 0, ``(*problems, n_states, n)``."""
+        false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
+        # A literal decides its clause where all others are false.
+        decides = (~false).sum(-1, keepdim=True) == (~false).int()
+        push = -self.polarity.double() * self.weight.double()[..., None, :, None] * decides
+        total = torch.zeros(x.shape, dtype=torch.float64, device=x.device)
+        return total.index_add_(-1, self.variables.flatten(), push.flatten(-2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +75,10 @@ class WeightedMaxSat:
         """Leading axes of independent problems."""
         return tuple(self.offset.shape)
 
+    def without_longer(self) -> "WeightedMaxSat":
+        """The same problem without its clauses of three literals and more."""
+        return replace(self, longer=())
+
     def energy(self, x: Tensor) -> Tensor:
         """Unsatisfied weight + offset in float64, ``(*problems, n_states)``, of ``x (*problems, n_states, n)``."""
         return self.unsatisfied_weight(x) + self.offset.double().unsqueeze(-1)
@@ -87,6 +100,19 @@ class WeightedMaxSat:
         unit = self.unit.double().unsqueeze(-2)
         units = (unit.abs() * ((x > 0.5) != (unit > 0))).sum(-1)
         return clauses + units + sum(block.unsatisfied_weight(x) for block in self.longer)
+
+    def field(self, x: Tensor) -> Tensor:
+        """Energy of x_i = 1 less energy of x_i = 0 in float64, ``(*problems, n_states, n)``, of binary states."""
+        first, second = self.graph.gather(2 * x.double() - 1)
+        over_states = -1 - len(self.graph.edge_shape)
+        polarity = [q.double().unsqueeze(over_states) for q in (self.first, self.second)]
+        false = [(1 - q * spin) / 2 for q, spin in zip(polarity, (first, second), strict=True)]
+        weight = self.weight.double().unsqueeze(over_states)
+        total = self.graph.scatter(-weight * polarity[0] * false[1], -weight * polarity[1] * false[0])
+        total = total - self.unit.double().unsqueeze(-2)
+        for block in self.longer:
+            total = total + block.field(x)
+        return total
 
     @staticmethod
     def from_clauses(

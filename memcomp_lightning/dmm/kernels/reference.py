@@ -1,69 +1,122 @@
-"""The readable kernel: plain torch on any device, all problems and restarts in one tensor program."""
+"""The readable kernel: plain torch on any device, any field and integrator, all restarts in one program."""
 
-from typing import NamedTuple, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from memcomp_lightning.dmm.base import HasVoltage, Recording, VectorField
+from memcomp_lightning.dmm.base import Recording, VectorField
 from memcomp_lightning.dmm.integrate import Integrator
-from memcomp_lightning.qubo.qubo import Qubo, Trajectory
+from memcomp_lightning.dmm.kernels.run import Run, Start, Visited
+from memcomp_lightning.qubo.maxsat import WeightedMaxSat
+from memcomp_lightning.qubo.qubo import Qubo
 
-MachineT = TypeVar("MachineT")
-StateT = TypeVar("StateT", bound=HasVoltage)
-
-
-class Run(NamedTuple):
-    """Outcome of one run of all restarts.
-
-    Attributes:
-        best: Best assignment a restart, ``(*problems, n_restarts, n)`` in {0, 1}.
-        found_at: Step at which it was met, ``(*problems, n_restarts)`` int64.
-        trajectory: The records, if asked for.
-    """
-
-    best: Tensor
-    found_at: Tensor
-    trajectory: Trajectory | None
+MAX_SWEEPS = 1000
+"""Ends a quench that rounding errors would keep alternating between equal energies."""
 
 
 def run(
-    field: VectorField[MachineT, StateT],
+    field: VectorField[Any, Any],
     integrator: Integrator,
-    machine: MachineT,
-    state: StateT,
-    qubo: Qubo,
+    problem: Qubo | WeightedMaxSat,
+    start: Start,
     *,
-    offset: Tensor,
     n_steps: int,
+    quench_every: int | None,
     recording: Recording | None,
 ) -> Run:
-    """Integrate for ``n_steps`` steps and keep the best assignment that the voltages pass through.
+    """Integrate for ``n_steps`` steps and keep the best assignment met.
 
-    ``offset`` is the energy at which all clauses are satisfied, ``(*problems,)``.
+    Args:
+        field: The vector field.
+        integrator: The scheme of one step.
+        problem: With one axis of problems.
+        start: Where each restart begins.
+        n_steps: Steps a restart.
+        quench_every: Descend by single flips from a copy of the digital state each so many steps.
+        recording: Which records to keep.
     """
-    exact = qubo.double()
+    machine = field.build(problem)
+    state = _warmed(field.init(machine, start.voltage), start.kept)
     best = state.voltage > 0
-    best_energy = exact.energy(best)
+    best_energy = problem.energy(best)
     found_at = torch.zeros(best_energy.shape, dtype=torch.int64, device=best.device)
     time = torch.zeros_like(best_energy)
-    recorded_until = time
-    records: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    for step in range(1, n_steps + 1):
-        state, dt = integrator.step(field, machine, state)
-        time = time + dt
+    times: list[Tensor] = []
+    states: list[Tensor] = []
+    for step in range(n_steps + 1):
+        if step > 0:
+            state, dt = integrator.step(field, machine, state)
+            state = _shaken(field.noise, state, dt, start.seed, step - 1)
+            time = time + dt
         x = state.voltage > 0
-        energy = exact.energy(x)
-        better = energy < best_energy
-        best = torch.where(better.unsqueeze(-1), x, best)
-        best_energy = torch.minimum(energy, best_energy)
-        found_at = torch.where(better, step, found_at)
-        if recording is not None and step % recording.every == 0:
-            unsatisfied = energy - offset.unsqueeze(-1)
-            records.append((time, unsatisfied, x, time - recorded_until))
-            recorded_until = time
-    trajectory = None
-    if recording is not None:
-        times, weights, states, dwells = (torch.stack(column, dim=-1) for column in zip(*records, strict=True))
-        trajectory = Trajectory(times, weights, states.movedim(-1, -2), dwells)
-    return Run(best=best.to(qubo.linear.dtype), found_at=found_at, trajectory=trajectory)
+        energy = problem.energy(x)
+        candidates = [(x, energy)]
+        if quench_every is not None and step % quench_every == 0:
+            quenched = quench(problem, x)
+            candidates.append((quenched, problem.energy(quenched)))
+        for candidate, its_energy in candidates:
+            better = its_energy < best_energy
+            best = torch.where(better.unsqueeze(-1), candidate, best)
+            best_energy = torch.minimum(its_energy, best_energy)
+            found_at = torch.where(better, step, found_at)
+        if recording is not None and step > 0 and step % recording.every == 0:
+            times.append(time)
+            states.append(x)
+    visited = Visited(torch.stack(times, dim=-1), torch.stack(states, dim=-2)) if times else None
+    return Run(best, found_at, state.voltage, _long_term(state), visited)
+
+
+def quench(problem: Qubo | WeightedMaxSat, x: Tensor) -> Tensor:
+    """Flip variables as long as that lowers the energy; bool in, bool out.
+
+    A QUBO is descended by blocks of uncoupled variables, MAX-SAT by the steepest single flips.
+    """
+    x = x.to(problem.linear.dtype if isinstance(problem, Qubo) else torch.float64)
+    for _ in range(MAX_SWEEPS):
+        before = x.clone()
+        if isinstance(problem, Qubo):
+            for block in problem.graph.blocks():
+                field = problem.field(x)[..., block]
+                # A tie keeps its value, so that equal energies cannot alternate for ever.
+                x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))
+        else:
+            gain = (1 - 2 * x) * problem.field(x)
+            lowest, at = gain.min(-1, keepdim=True)
+            flipped = x.scatter(-1, at, 1 - x.gather(-1, at))
+            x = torch.where(lowest < 0, flipped, x)
+        if torch.equal(x, before):
+            break
+    return x > 0.5
+
+
+def uniform(seed: Tensor, counter: Tensor) -> Tensor:
+    """Numbers in [-1, 1) that depend on nothing but the arguments: a hash of both (Murmur3's finaliser)."""
+    word = 0xFFFFFFFF
+    z = (seed + counter * 0x9E3779B9) & word
+    z = ((z ^ (z >> 16)) * 0x85EBCA6B) & word
+    z = ((z ^ (z >> 13)) * 0xC2B2AE35) & word
+    z = z ^ (z >> 16)
+    return (z >> 8) * 2.0**-23 - 1
+
+
+def _shaken(noise: float, state: Any, dt: Tensor, seed: Tensor, step: int) -> Any:
+    """Add the noise of one step to the voltages."""
+    if noise == 0:
+        return state
+    n = state.voltage.shape[-1]
+    counter = step * n + torch.arange(n, device=seed.device)
+    shake = uniform(seed.unsqueeze(-1), counter).to(state.voltage.dtype)
+    width = noise * dt.sqrt().unsqueeze(-1)
+    return state._replace(voltage=(state.voltage + width * shake).clamp(-1, 1))
+
+
+def _warmed(state: Any, kept: tuple[Tensor, ...]) -> Any:
+    """The state with long-term memories that were kept."""
+    names = [name for name in state._fields if name.endswith("long_term")]
+    return state._replace(**{name: 1 + memory for name, memory in zip(names, kept, strict=False)})
+
+
+def _long_term(state: Any) -> tuple[Tensor, ...]:
+    """Long-term memories less their rest value."""
+    return tuple(getattr(state, name) - 1 for name in state._fields if name.endswith("long_term"))

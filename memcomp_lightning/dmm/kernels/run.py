@@ -1,0 +1,50 @@
+"""What every kernel takes and returns."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Visited(NamedTuple):
+    """Digital states at intervals.
+
+    Attributes:
+        time: Machine time, ``(n_problems, n_restarts, n_records)`` float64.
+        states: ``(n_problems, n_restarts, n_records, n)`` bool.
+    """
+
+    time: Tensor
+    states: Tensor
+
+
+class Start(NamedTuple):
+    """Where a run begins.
+
+    Attributes:
+        voltage: ``(n_problems, n_restarts, n)`` in [-1, 1].
+        kept: Long-term memories less their rest value 1, as an earlier run of the same kernel returned them;
+            empty for memories at rest.
+        seed: Of the noise, ``(n_problems, n_restarts)`` int64 in [0, 2^32).
+    """
+
+    voltage: Tensor
+    kept: tuple[Tensor, ...]
+    seed: Tensor
+
+
+class Run(NamedTuple):
+    """Outcome of one run of all restarts.
+
+    Attributes:
+        best: Best assignment a restart, ``(n_problems, n_restarts, n)`` bool.
+        found_at: Step at which it was met, ``(n_problems, n_restarts)`` int64; 0 is the start.
+        voltage: Final voltages.
+        kept: Final long-term memories less 1, for a warm restart.
+        visited: The records, if asked for.
+    """
+
+    best: Tensor
+    found_at: Tensor
+    voltage: Tensor
+    kept: tuple[Tensor, ...]
+    visited: Visited | None

@@ -1,0 +1,67 @@
+"""The rule that carries one set of constants from 32 to 100,000 variables."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from memcomp_lightning.qubo.graph import Graph
+
+_SMALLEST_RATIO = 1e-12
+"""Couplings this much smaller than the largest unit clause or field do not set the scale."""
+
+
+def by_largest(coupling: Tensor, linear: Tensor, n_axes: int) -> tuple[Tensor, Tensor]:
+    """Divide by the largest entry: squares of 1e-30 or 1e30 would leave the range of float32.
+
+    Args:
+        coupling: ``(*problems, *edge_shape)``, ``n_axes`` of them edge axes.
+        linear: ``(*problems, n)``.
+        n_axes: Number of edge axes.
+    """
+    largest = torch.maximum(amax(coupling.abs(), n_axes), linear.abs().amax(-1))
+    largest = torch.where(largest > 0, largest, torch.ones_like(largest))
+    # In two steps, as the reciprocal of a subnormal number is infinite.
+    return coupling / expand(largest, n_axes), linear / largest.unsqueeze(-1)
+
+
+def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
+    r"""Root mean square over the coupled variables of ``\sqrt{\sum_j w_ij^2}``, ``(*problems,)``.
+
+    A random assignment drives a variable with about this strength, whatever the size and the degree: divided by
+    it, couplings give rates of order 1. Zero couplings and isolated variables do not change it. 1 where
+    nothing is coupled.
+    """
+    power = coupling.square()
+    per_variable = graph.scatter(power, power)
+    norm = (per_variable.sum(-1) / (per_variable > 0).sum(-1).clamp(min=1)).sqrt()
+    return torch.where(norm > _SMALLEST_RATIO, norm, torch.ones_like(norm))
+
+
+def mean_strength(graph: Graph, coupling: Tensor) -> Tensor:
+    r"""Mean over the coupled variables of ``\sum_j |w_ij|``, ``(*problems,)``; 1 where nothing is coupled."""
+    size = coupling.abs()
+    per_variable = graph.scatter(size, size)
+    mean = per_variable.sum(-1) / (per_variable > 0).sum(-1).clamp(min=1)
+    return torch.where(mean > _SMALLEST_RATIO, mean, torch.ones_like(mean))
+
+
+def decisive(graph: Graph, coupling: Tensor, linear: Tensor) -> Tensor:
+    r"""Limit \|linear_i\| to twice ``\sum_j |w_ij|``, at least 1, which decides a variable as surely.
+
+    Unlimited, one huge field would set the step size of a whole machine.
+    """
+    size = coupling.abs()
+    limit = (2 * graph.scatter(size, size)).clamp(min=1)
+    return torch.minimum(torch.maximum(linear, -limit), limit)
+
+
+def expand(x: Tensor, n_axes: int) -> Tensor:
+    """Append axes of size 1."""
+    return x.reshape(*x.shape, *(1,) * n_axes)
+
+
+def amax(x: Tensor, n_axes: int) -> Tensor:
+    """Maximum over the last axes, 0 where they are empty."""
+    axes = tuple(range(-n_axes, 0))
+    return x.amax(axes) if math.prod(x.shape[axes[0] :]) else x.sum(axes)
