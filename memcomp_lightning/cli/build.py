@@ -1,6 +1,5 @@
 """From a configuration to the objects of a run; everything that can be refused is refused here."""
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import MomentumSchedule
 from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.models import DBN
@@ -72,9 +72,9 @@ def build(config: DictConfig) -> Plan:
     for group, known in _SETTINGS.items():
         for name in config if group == "" else config[group]:
             require_choice(f"setting {group}".rstrip(), name, known)
-    _check_finite(config)
+    check_finite(config)
     seed = config.seed
-    require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
+    check_seed(seed)
     images = _load(instantiate(config.data.source))
     network = _network(config, images)
     for stage in ("pretrain", "finetune"):
@@ -175,16 +175,6 @@ def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> 
 
 def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
     return [instantiate(callback) for callback in config.callbacks[stage].values() if callback is not None]
-
-
-def _check_finite(node: Any, name: str = "") -> None:
-    """Refuse NaN and infinity anywhere: optimisers and samplers would take some of them."""
-    if isinstance(node, DictConfig):
-        for key in node:
-            if not OmegaConf.is_interpolation(node, str(key)):
-                _check_finite(node[key], f"{name}.{key!s}".lstrip("."))
-    elif isinstance(node, float):
-        require(math.isfinite(node), name, node, "a finite number")
 
 
 _PRECISIONS = {"64-true": torch.float64, "16-true": torch.float16, "bf16-true": torch.bfloat16}

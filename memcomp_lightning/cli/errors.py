@@ -1,9 +1,11 @@
 """Errors as a user meets them: one message, no stack of frames from libraries."""
 
 import difflib
+import sys
+from collections.abc import Collection
+from typing import NoReturn
 
 from hydra.errors import HydraException, InstantiationException
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -19,9 +21,20 @@ CONFIGURATION_ERRORS = (
     OSError,
     HydraException,
     OmegaConfBaseException,
-    MisconfigurationException,
 )
-"""What building a run may raise on account of its settings. (SettingError and CheckpointError are ValueErrors.)"""
+"""What building a run may raise on account of its settings; the package's own errors are ValueErrors."""
+
+USAGE_ERROR = 2
+"""Exit status when a setting is refused."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
+
+def refuse(command: str, error: Exception) -> NoReturn:
+    """End with the message alone."""
+    print(f"{command}: {error}", file=sys.stderr)
+    sys.exit(USAGE_ERROR)
 
 
 def explain(error: BaseException) -> str:
@@ -40,27 +53,30 @@ def explain(error: BaseException) -> str:
     return str(error)
 
 
-def unknown_setting(override: str, defaults: DictConfig) -> str | None:
-    """Return a message if an override names a setting ``group.name`` that does not exist, with what is close.
+def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str] = ()) -> str | None:
+    """Return a message if an override names a setting that does not exist, with what is close.
 
     Args:
         override: As typed: ``pretrain.iteration=20``.
         defaults: A composed configuration of the same groups.
+        groups: The groups; not all of them appear in the configuration.
     """
-    name, _, value = override.partition("=")
-    parent, _, leaf = name.rpartition(".")
-    if not parent or name[0] in "+~" or "@" in name or name.startswith("hydra."):
+    name, equals, _ = override.partition("=")
+    if name[:1] in ("+", "~") or "@" in name or "/" in name or name.partition(".")[0] == "hydra":
         return None
-    node = OmegaConf.select(defaults, parent)
+    if not equals:
+        return f"{override} is no setting: expected NAME=VALUE."
+    parent, _, leaf = name.rpartition(".")
+    node = OmegaConf.select(defaults, parent) if parent else defaults
     if isinstance(node, DictConfig):
-        if leaf in node:
+        if leaf in node or name in groups:
             return None
-        known = sorted(f"{parent}.{key!s}" for key in node)
+        known = sorted(f"{parent}.{key!s}".lstrip(".") for key in node)
     else:
         known = sorted(str(key) for key in defaults)
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {close[0]}?" if close else ""
-    return f"setting {name} (given as {name}={value}) does not exist.{hint} Known here: {', '.join(known)}."
+    return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
 
 
 def _full_key(error: InstantiationException) -> str:

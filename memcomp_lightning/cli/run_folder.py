@@ -13,13 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning import __version__
 from memcomp_lightning.cli.errors import UserError
-from memcomp_lightning.modules.weights import written_whole
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file so that an interruption leaves the old one or the new one."""
-    with written_whole(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+from memcomp_lightning.files import write_text
 
 
 @dataclass(frozen=True)

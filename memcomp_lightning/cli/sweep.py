@@ -1,46 +1,17 @@
-"""Multirun: every job checked before the first one trains, one merged table at the end."""
+"""Multirun: one merged table at the end."""
 
 import csv
-import hashlib
 import io
-import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_module
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
-from memcomp_lightning.cli.pipeline import make_trainer
-from memcomp_lightning.cli.run_folder import RunFolder, write_text
+from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import aligned, mean_and_error, with_error
-
-CONFIG_MODULE = "memcomp_lightning.conf"
-
-
-LONGEST_NAME = 150
-"""Characters of a job's folder; file systems allow 255."""
-
-
-def job_folder(overrides: str) -> str:
-    """Name of a job's folder: its overrides, as one path component that every file system takes.
-
-    >>> job_folder("sampler=cd,model.weights=runs/a.pt")
-    'sampler=cd,model.weights=runs_a.pt'
-    """
-    name = overrides.replace("/", "_").replace("\\", "_")
-    if len(name) > LONGEST_NAME:
-        name = f"{name[:LONGEST_NAME]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
-    return name or "job"
-
-
-OmegaConf.register_new_resolver("memcomp_job_folder", job_folder, replace=True)
+from memcomp_lightning.files import write_text
 
 
 class RememberSweepFolder(Callback):
@@ -51,61 +22,6 @@ class RememberSweepFolder(Callback):
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Called once, before the jobs."""
         RememberSweepFolder.folder = Path(config.hydra.sweep.dir).absolute()
-
-
-def check_overrides(overrides: Sequence[str], *, multirun: bool) -> None:
-    """Build every job that the overrides stand for, and train none.
-
-    Raises:
-        UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
-    """
-    _check_writable(overrides, multirun=multirun)
-    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
-        try:
-            jobs = _jobs(overrides) if multirun else [list(overrides)]
-            defaults = compose("config", [o for o in jobs[0] if _chooses_group(o)])
-        except CONFIGURATION_ERRORS as error:
-            raise UserError(explain(error)) from error
-        for message in (unknown_setting(override, defaults) for override in jobs[0]):
-            if message is not None:
-                raise UserError(message)
-        for job in jobs:
-            try:
-                config = compose("config", job)
-                plan = build(config)
-                world_size = make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path()).world_size
-                for stage in plan.stages:
-                    stage.data.train_batches(0, world_size)
-            except CONFIGURATION_ERRORS as error:
-                where = f" (job {' '.join(job)})" if multirun else ""
-                raise UserError(explain(error) + where) from error
-
-
-def _check_writable(overrides: Sequence[str], *, multirun: bool) -> None:
-    """Raise unless a file can be made where the run folder will be."""
-    key, default = ("hydra.sweep.dir", "multirun") if multirun else ("hydra.run.dir", "runs")
-    given = dict(override.split("=", 1) for override in overrides if override.startswith(f"{key}="))
-    folder = Path(given.get(key, default).strip("'\"")).absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    try:
-        with tempfile.TemporaryFile(dir=existing):
-            pass
-    except OSError as error:
-        raise UserError(
-            f"{key} = {folder} is not allowed: no file can be written in {existing} ({error.strerror}). Choose "
-            f"another folder with {key}=PATH."
-        ) from error
-
-
-def _jobs(overrides: Sequence[str]) -> list[list[str]]:
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    return jobs
-
-
-def _chooses_group(override: str) -> bool:
-    name, _, value = override.partition("=")
-    return "." not in name and name not in ("seed",) and bool(value)
 
 
 def merge(folder: Path) -> tuple[str, int]:

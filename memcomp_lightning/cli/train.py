@@ -6,29 +6,29 @@ import sys
 import traceback
 import warnings
 from pathlib import Path
-from typing import NoReturn
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli import pipeline, sweep
 from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.errors import UserError, explain
+from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
+from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.modules import CheckpointError, DivergedError
 
-USAGE_ERROR = 2
-"""Exit status when a setting is refused."""
+COMMAND = "memcomp-train"
 
 log = logging.getLogger(__name__)
 
 
-@hydra.main(config_path=f"pkg://{sweep.CONFIG_MODULE}", config_name="config", version_base="1.3")
+@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", version_base="1.3")
 def train(config: DictConfig) -> None:
     """One run, or one job of a sweep."""
     _silence_lightning()  # again: a job of a parallel launcher is in a process of its own
@@ -39,17 +39,22 @@ def train(config: DictConfig) -> None:
         _train(config, folder, list(settings.overrides.task))
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
-            refuse(error)
+            refuse(COMMAND, error)
         if not in_sweep:
             raise
         folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
         log.error("Failed, the sweep goes on: %s", explain(error))
 
 
-def refuse(error: Exception) -> NoReturn:
-    """End with the message alone."""
-    print(f"memcomp-train: {error}", file=sys.stderr)
-    sys.exit(USAGE_ERROR)
+def _check(config: DictConfig) -> None:
+    """Build a job, and train nothing."""
+    plan = build(config)
+    try:
+        trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
+    except MisconfigurationException as error:
+        raise UserError(explain(error)) from error
+    for stage in plan.stages:
+        stage.data.train_batches(0, trainer.world_size)
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
@@ -99,25 +104,24 @@ def main() -> None:
     _silence_lightning()
     try:
         sys.argv[1:] = _resumed(sys.argv[1:])
-        flags = {argument for argument in sys.argv[1:] if argument.startswith("-")}
-        multirun = bool(flags & {"-m", "--multirun"})
-        if multirun and any(a.startswith("trainer.devices=") and a != "trainer.devices=1" for a in sys.argv):
+        if is_multirun(sys.argv) and any(
+            a.startswith("trainer.devices=") and a != "trainer.devices=1" for a in sys.argv
+        ):
             raise UserError(
                 "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
                 "processes. Give the jobs one by one, or use one device with a parallel launcher."
             )
-        if flags <= {"-m", "--multirun"} and "LOCAL_RANK" not in os.environ:
-            overrides = [a for a in sys.argv[1:] if a not in flags]
-            sweep.check_overrides(overrides, multirun=multirun)
+        if "LOCAL_RANK" not in os.environ:
+            check_command_line(sys.argv[1:], config_name="config", check=_check, folders=("runs", "multirun"))
         train()
     except UserError as error:
-        refuse(error)
+        refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
         how = str(interrupt)
         if sweep.RememberSweepFolder.folder is not None:
             how = f"Go on with the same command and hydra.sweep.dir={short_path(sweep.RememberSweepFolder.folder)}"
-        print(f"\nmemcomp-train: interrupted. {how}".rstrip(), file=sys.stderr)
-        sys.exit(130)
+        print(f"\n{COMMAND}: interrupted. {how}".rstrip(), file=sys.stderr)
+        sys.exit(INTERRUPTED)
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
         print(f"\n{table}\n{closing_lines(short_path(folder))}", flush=True)

@@ -4,7 +4,7 @@ from memcomp_lightning.dmm.base import Recording, VectorField
 from memcomp_lightning.dmm.bond import BondField
 from memcomp_lightning.dmm.clause import ClauseField
 from memcomp_lightning.dmm.integrate import AdaptiveEuler, ExactShortTerm, Heun, Integrator, Splitting, Strang
-from memcomp_lightning.dmm.solver import DmmSolver, WarmRestart, default_steps
+from memcomp_lightning.dmm.solver import DmmSolver, WarmRestart, default_quench, default_steps
 
 __all__ = [
     "AdaptiveEuler",
@@ -19,5 +19,6 @@ __all__ = [
     "Strang",
     "VectorField",
     "WarmRestart",
+    "default_quench",
     "default_steps",
 ]

@@ -49,6 +49,10 @@ class VectorField(Protocol[MachineT, StateT]):
         """Scale a problem into the machine's units."""
         ...
 
+    def stability(self, machine: MachineT) -> Tensor:
+        """Factor in (0, 1] on the largest change of a voltage in a step, ``(*problems, 1)``."""
+        ...
+
     def init(self, machine: MachineT, voltage: Tensor) -> StateT:
         """The memories that belong to initial voltages ``(*problems, n_restarts, n)``."""
         ...

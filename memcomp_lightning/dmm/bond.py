@@ -10,7 +10,14 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
-from memcomp_lightning.dmm.scaling import by_largest, coupling_norm, decisive, expand, mean_strength
+from memcomp_lightning.dmm.scaling import (
+    by_largest,
+    collective_mode,
+    coupling_norm,
+    decisive,
+    expand,
+    mean_strength,
+)
 from memcomp_lightning.errors import require
 from memcomp_lightning.qubo.graph import Graph
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, to_qubo
@@ -18,9 +25,9 @@ from memcomp_lightning.qubo.qubo import Qubo
 
 
 class BondMachine(NamedTuple):
-    """Ferromagnetic bonds and fields in the machine's units, with an axis of size 1 for the restarts.
+    r"""Ferromagnetic bonds and fields in the machine's units, with an axis of size 1 for the restarts.
 
-    ``pull_scale`` is the mean over the spins of ``\\sum_j |J_ij|`` in the same units.
+    ``pull_scale`` is the mean over the spins of ``\sum_j |J_ij|`` in the same units.
     """
 
     graph: Graph
@@ -52,7 +59,7 @@ class BondField:
         \dot Y &= \delta X - \zeta, \quad Y \in [1, Y_{max}]
 
     where s is the mean over the spins of ``\sum_j |J_ij|``. Bonds are divided by
-    :func:`~memcomp_lightning.dmm.scaling.coupling_norm`.
+    :func:`~memcomp_lightning.dmm.scaling.coupling_norm`, or by half their largest eigenvalue if that is more.
 
     Deviations from [P]: a bond pulls its spins to 0 in proportion to its strength (there, all bonds alike),
     which makes the machine the same with or without bonds of strength 0; satisfaction counts by its sign.
@@ -72,18 +79,18 @@ class BondField:
         integrator: The scheme that the constants were chosen with.
     """
 
-    alpha: float = 3.5
-    beta: float = 7.0
-    gamma: float = 0.53
-    kappa: float = 1.2
-    delta: float = 0.33
-    zeta: float = 1.45
-    short_term_start: float = 1.0
-    short_term_min: float = 0.02
-    long_term_max: float = 10.0
-    noise: float = 1.7
+    alpha: float = 2.07
+    beta: float = 7.74
+    gamma: float = 0.606
+    kappa: float = 1.32
+    delta: float = 0.476
+    zeta: float = 2.98
+    short_term_start: float = 0.28
+    short_term_min: float = 0.0164
+    long_term_max: float = 4.15
+    noise: float = 0.79
     spread: float = 1.0
-    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=1.0, dt_min=0.106, dt_max=0.106))
+    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=1.0, dt_min=0.183, dt_max=0.183))
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "gamma", "delta", "zeta"):
@@ -107,7 +114,8 @@ class BondField:
         coupling, linear = by_largest(qubo.coupling, qubo.linear, n_axes)
         # The energy is coupling / 4 a bond and linear / 2 + sum of couplings / 4 a field: here times -4.
         field = -2 * linear - qubo.graph.scatter(coupling, coupling)
-        scale = coupling_norm(qubo.graph, coupling)
+        norm = coupling_norm(qubo.graph, coupling)
+        scale = norm / collective_mode(qubo.graph, coupling, norm)
         bond = -coupling / expand(scale, n_axes)
         field = decisive(qubo.graph, bond, field / scale.unsqueeze(-1))
         return BondMachine(
@@ -116,6 +124,10 @@ class BondField:
             field=field.unsqueeze(-2),
             pull_scale=expand(mean_strength(qubo.graph, bond), 2),
         )
+
+    def stability(self, machine: BondMachine) -> Tensor:
+        """1: the scale of the bonds takes care of it."""
+        return torch.ones_like(machine.pull_scale.squeeze(-1))
 
     def init(self, machine: BondMachine, voltage: Tensor) -> BondState:
         """Short-term memories at ``short_term_start``, long-term ones at 1."""
@@ -143,7 +155,8 @@ class BondField:
             short_term=self.gamma * (1 + self.kappa * machine.bond.sign() * first * second) - state.long_term,
             # [P]: dY = delta X - zeta.
             long_term=self.delta * state.short_term - self.zeta,
-            field_short_term=self.gamma * (1 + self.kappa * machine.field.sign() * voltage) - state.field_long_term,
+            field_short_term=self.gamma * (1 + self.kappa * machine.field.sign() * voltage)
+            - state.field_long_term,
             field_long_term=self.delta * state.field_short_term - self.zeta,
         )
 

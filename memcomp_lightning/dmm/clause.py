@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
-from memcomp_lightning.dmm.scaling import by_largest, coupling_norm, decisive, expand
+from memcomp_lightning.dmm.scaling import by_largest, collective_mode, coupling_norm, decisive, expand
 from memcomp_lightning.errors import require
 from memcomp_lightning.qubo.graph import Graph
 from memcomp_lightning.qubo.maxsat import Clauses, WeightedMaxSat, from_qubo
@@ -33,6 +33,7 @@ class ClauseMachine(NamedTuple):
     longer_variables: Tensor
     longer_polarity: Tensor
     longer_weight: Tensor
+    stability: Tensor
 
 
 class ClauseState(NamedTuple):
@@ -78,17 +79,17 @@ class ClauseField:
         integrator: The scheme that the constants were chosen with.
     """
 
-    alpha: float = 7.6
-    beta: float = 0.39
-    gamma: float = 0.033
-    delta: float = 0.0073
-    epsilon: float = 0.041
+    alpha: float = 29.7
+    beta: float = 0.106
+    gamma: float = 0.0239
+    delta: float = 0.0098
+    epsilon: float = 0.52
     zeta: float = 0.040
-    long_term_max: float = 3.3
-    unit_pull: float = 0.99
+    long_term_max: float = 13.5
+    unit_pull: float = 0.995
     noise: float = 0.0
-    spread: float = 1.0
-    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=2.35, dt_min=0.0126, dt_max=2.8))
+    spread: float = 0.3
+    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=3.66, dt_min=0.0126, dt_max=1.92))
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "epsilon", "unit_pull"):
@@ -125,12 +126,21 @@ class ClauseField:
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
             longer_weight=(longer_weight / scale.unsqueeze(-1)).unsqueeze(-2),
+            stability=collective_mode(
+                maxsat.graph, weight * maxsat.first * maxsat.second, torch.ones_like(scale)
+            ).unsqueeze(-1),
         )
+
+    def stability(self, machine: ClauseMachine) -> Tensor:
+        """Smaller steps where all variables pull alike."""
+        return machine.stability
 
     def init(self, machine: ClauseMachine, voltage: Tensor) -> ClauseState:
         """x_s(0) = C(0), long-term memories at 1 ([B], methods)."""
         unsatisfied, _, _ = _unsatisfaction(machine, voltage)
-        longer = _falsehood(machine, voltage).amin(-1) if machine.longer_weight.numel() else _none(machine, voltage)
+        longer = voltage.new_zeros(*voltage.shape[:-1], machine.longer_weight.shape[-1])
+        if machine.longer_weight.numel():
+            longer = _falsehood(machine, voltage).amin(-1)
         return ClauseState(
             voltage=voltage,
             short_term=unsatisfied,
@@ -165,9 +175,7 @@ class ClauseField:
             voltage=drive,
             short_term=self._short_term_rate(unsatisfied, state.short_term),
             long_term=self._long_term_rate(unsatisfied, state.long_term),
-            unit_long_term=self._long_term_rate(
-                0.5 * (1 - machine.unit_sign * voltage), state.unit_long_term
-            ),
+            unit_long_term=self._long_term_rate(0.5 * (1 - machine.unit_sign * voltage), state.unit_long_term),
             longer_short_term=self._short_term_rate(longer_unsatisfied, state.longer_short_term),
             longer_long_term=self._long_term_rate(longer_unsatisfied, state.longer_long_term),
         )
@@ -179,9 +187,8 @@ class ClauseField:
         is_smallest = torch.nn.functional.one_hot(at, false.shape[-1]).bool()
         others = torch.where(is_smallest, next_smallest.unsqueeze(-1), smallest.unsqueeze(-1))
         gradient = machine.longer_weight * state.longer_long_term * state.longer_short_term
-        rigidity = (
-            machine.longer_weight * (1 + self.zeta * state.longer_long_term) * (1 - state.longer_short_term) * smallest
-        )
+        stiffness = (1 + self.zeta * state.longer_long_term) * (1 - state.longer_short_term)
+        rigidity = machine.longer_weight * stiffness * smallest
         push = machine.longer_polarity * (gradient.unsqueeze(-1) * others + rigidity.unsqueeze(-1) * is_smallest)
         drive = torch.zeros_like(state.voltage)
         drive.index_add_(-1, machine.longer_variables.flatten(), push.flatten(-2))
@@ -232,11 +239,6 @@ def _falsehood(machine: ClauseMachine, voltage: Tensor) -> Tensor:
     """How false each literal of the longer clauses is; 1 for a padded one, which is never the smallest."""
     false = 0.5 - 0.5 * machine.longer_polarity * voltage[..., machine.longer_variables]
     return torch.where(machine.longer_polarity == 0, 1.0, false)
-
-
-def _none(machine: ClauseMachine, voltage: Tensor) -> Tensor:
-    """Memories of no clause."""
-    return voltage.new_zeros(*voltage.shape[:-1], 0)
 
 
 def _padded(maxsat: WeightedMaxSat) -> Clauses:

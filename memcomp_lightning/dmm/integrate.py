@@ -25,7 +25,9 @@ class Integrator(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StepControl:
-    """``dt = clip(max_change / max_i |dv_i/dt|, dt_min, dt_max)``, for each restart on its own.
+    """``dt = clip(s max_change / max_i |dv_i/dt|, dt_min, dt_max)``, for each restart on its own.
+
+    The factor s is the field's ``stability`` on the problem.
 
     Source: Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), methods. The steps are far too large for an
     accurate trajectory; what matters is that the machine keeps its attractors.
@@ -44,9 +46,9 @@ class StepControl:
         require(self.max_change > 0, "max_change", self.max_change, "a number > 0")
         require(0 < self.dt_min <= self.dt_max, "dt_min", self.dt_min, f"a number in (0, dt_max = {self.dt_max}]")
 
-    def step_size(self, voltage_rate: Tensor) -> Tensor:
+    def step_size(self, voltage_rate: Tensor, stability: Tensor) -> Tensor:
         """Step sizes ``(*problems, n_restarts)`` from ``dv/dt``."""
-        return (self.max_change / voltage_rate.abs().amax(-1)).clamp(self.dt_min, self.dt_max)
+        return (stability * self.max_change / voltage_rate.abs().amax(-1)).clamp(self.dt_min, self.dt_max)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,7 +60,7 @@ class AdaptiveEuler(StepControl):
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
-        dt = self.step_size(rate.voltage)
+        dt = self.step_size(rate.voltage, field.stability(machine))
         return field.bound(machine, _move(state, rate, dt)), dt
 
 
@@ -74,7 +76,7 @@ class Splitting(StepControl):
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
-        dt = self.step_size(rate.voltage)
+        dt = self.step_size(rate.voltage, field.stability(machine))
         state = field.bound(machine, _move_voltage(state, rate, dt))
         return _move_memories(field, machine, state, dt), dt
 
@@ -87,7 +89,7 @@ class Strang(StepControl):
         self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
-        dt = self.step_size(field.derivative(machine, state).voltage)
+        dt = self.step_size(field.derivative(machine, state).voltage, field.stability(machine))
         state = _move_memories(field, machine, state, dt / 2)
         rate = field.derivative(machine, state)
         state = field.bound(machine, _move_voltage(state, rate, dt))
@@ -111,7 +113,7 @@ class ExactShortTerm(StepControl):
             "The field has no method short_term_after(machine, state, dt): use Splitting.",
         )
         rate = field.derivative(machine, state)
-        dt = self.step_size(rate.voltage)
+        dt = self.step_size(rate.voltage, field.stability(machine))
         state = field.bound(machine, _move_voltage(state, rate, dt))
         exact = field.short_term_after(machine, state, dt)
         moved = _move_memories(field, machine, state, dt)
@@ -127,7 +129,7 @@ class Heun(StepControl):
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
-        dt = self.step_size(rate.voltage)
+        dt = self.step_size(rate.voltage, field.stability(machine))
         ahead = field.derivative(machine, field.bound(machine, _move(state, rate, dt)))
         mean = type(rate)(*((a + b) / 2 for a, b in zip(_tensors(rate), _tensors(ahead), strict=True)))
         return field.bound(machine, _move(state, mean, dt)), dt

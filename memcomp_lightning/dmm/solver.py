@@ -21,6 +21,7 @@ from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.kernels import reference
 from memcomp_lightning.dmm.kernels.run import Run, Start
 from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.qubo.graph import Bipartite
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status, Trajectory
 
@@ -59,8 +60,9 @@ class DmmSolver:
         patience: Restarts without a better assignment after which a problem is done, 1 to n_restarts; None
             runs all restarts at once.
         max_steps: Integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
-        quench_every: Each so many steps a copy of the digital state descends by single flips, and counts if it
-            ends lower; the machine does not feel it. None reads the voltages alone.
+        quench_every: Each so many steps the digital state is read, and a copy of it descends by single flips;
+            the machine does not feel it. 0 reads at every step, without a descent. None takes
+            :func:`default_quench` of the problem.
         warm: How later groups begin; None draws new voltages with memories at rest.
         record: Records trajectories, for the time average and for plots; None does not.
         kernel: "compiled" for the CPU, "reference" in plain torch for any device, field and integrator, or
@@ -77,16 +79,16 @@ class DmmSolver:
     n_restarts: int = 28
     patience: int | None = None
     max_steps: int | None = None
-    quench_every: int | None = 2
+    quench_every: int | None = None
     warm: WarmRestart | None = None
     record: Recording | None = None
     kernel: Literal["auto", "compiled", "reference"] = "auto"
 
     def __post_init__(self) -> None:
         require_count("n_restarts", self.n_restarts)
-        for name in ("max_steps", "patience", "quench_every"):
+        for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
             if getattr(self, name) is not None:
-                require_count(name, getattr(self, name))
+                require_count(name, getattr(self, name), smallest)
         if self.patience is not None:
             require(
                 self.patience <= self.n_restarts,
@@ -184,21 +186,20 @@ class DmmSolver:
         """Run the kernel that the settings ask for."""
         integrator = self.integrator or self.field.integrator
         obstacle = None if self.kernel == "reference" else self._obstacle(start.voltage.device.type)
-        if self.kernel == "reference" or obstacle is not None:
-            if obstacle is not None:
-                _say_once(obstacle)
-            kernel = reference.run
-        else:
+        kernel: Callable[..., Run] = reference.run
+        if obstacle is not None:
+            _say_once(obstacle)
+        elif self.kernel != "reference":
             from memcomp_lightning.dmm.kernels import cpu
 
             kernel = cpu.run
         return kernel(
             self.field,
-            integrator,  # type: ignore[arg-type]
+            integrator,
             problem,
             start,
             n_steps=n_steps,
-            quench_every=self.quench_every,
+            quench_every=default_quench(problem) if self.quench_every is None else self.quench_every,
             recording=self.record,
         )
 
@@ -217,8 +218,21 @@ class DmmSolver:
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps a restart, by the rule ``50 sqrt(n)`` of the number of variables, at least 200."""
-    return max(200, round(50 * math.sqrt(problem.n)))
+    """Steps a restart, by the rule ``25 sqrt(n)`` of the number of variables, at least 200."""
+    return max(200, round(25 * math.sqrt(problem.n)))
+
+
+def default_quench(problem: Qubo | WeightedMaxSat) -> int:
+    """Steps between two readings: 1 for two coupled layers, else by the rule ``12 n / n_pairs``, at least 4.
+
+    A step costs as much as the pairs, a descent as much as the variables and its flips, which are cheap where the
+    couplings are a matrix.
+    """
+    if isinstance(problem.graph, Bipartite):
+        return 1
+    n_pairs = math.prod(problem.graph.edge_shape)
+    n_pairs += 0 if isinstance(problem, Qubo) else sum(len(block.variables) for block in problem.longer)
+    return max(4, round(12 * problem.n / max(n_pairs, 1)))
 
 
 @cache
@@ -259,7 +273,8 @@ def _select(problem: Qubo | WeightedMaxSat, chosen: Tensor) -> Qubo | WeightedMa
 
 def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -> Trajectory:
     """Add what the records weigh, from their states in float64, and how long each one stands."""
-    energies = problem.energy(states.flatten(1, 2)).reshape(times.shape)
+    # One record of all restarts at a time: all at once would need memory for records x pairs.
+    energies = torch.stack([problem.energy(record) for record in states.unbind(2)], dim=-1)
     offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
     dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
     return Trajectory(times, energies - offset[:, None, None], states, dwell)

@@ -1,14 +1,13 @@
 """Weight files: written whole or not at all, read without executing code, refused with the cause."""
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
+
+from memcomp_lightning.files import written_whole
 
 
 class CheckpointError(ValueError):
@@ -30,17 +29,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write a checkpoint, or leave the old one."""
         _write(checkpoint, Path(path))
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Give a file beside ``path`` to write; rename it on success, so that an interruption leaves the old one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _write(content: Any, path: Path) -> None:

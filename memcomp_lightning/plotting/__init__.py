@@ -1,5 +1,6 @@
 """Arrays in, pictures out."""
 
 from memcomp_lightning.plotting.grid import picture_grid
+from memcomp_lightning.plotting.trajectory import plot_trajectory
 
-__all__ = ["picture_grid"]
+__all__ = ["picture_grid", "plot_trajectory"]

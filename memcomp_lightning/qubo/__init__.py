@@ -1,26 +1,34 @@
-"""QUBO and weighted MAX-SAT: problems, exact mappings between them, simple solvers."""
+"""QUBO and weighted MAX-SAT: problems and their files, exact mappings between them, simple solvers."""
 
 from memcomp_lightning.qubo.alternating_descent import AlternatingDescent
 from memcomp_lightning.qubo.brute_force import BruteForce
+from memcomp_lightning.qubo.formats import FORMATS, ProblemFileError
 from memcomp_lightning.qubo.from_model import from_model
 from memcomp_lightning.qubo.graph import Bipartite, EdgeList, Graph
+from memcomp_lightning.qubo.io import Problem, Score, read_problem, write_solution
 from memcomp_lightning.qubo.maxsat import Clauses, WeightedMaxSat, from_qubo, to_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, QuboSolver, Status, Trajectory
 
 __all__ = [
+    "FORMATS",
     "AlternatingDescent",
     "Bipartite",
     "BruteForce",
     "Clauses",
     "EdgeList",
     "Graph",
+    "Problem",
+    "ProblemFileError",
     "Qubo",
     "QuboSolution",
     "QuboSolver",
+    "Score",
     "Status",
     "Trajectory",
     "WeightedMaxSat",
     "from_model",
     "from_qubo",
+    "read_problem",
     "to_qubo",
+    "write_solution",
 ]

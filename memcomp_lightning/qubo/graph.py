@@ -47,6 +47,10 @@ class Graph(Protocol):
         """Derivative of :meth:`quadratic` by x: ``(*leading, n_states, n)``."""
         ...
 
+    def alternating(self) -> Tensor:
+        """+1 or -1 for each pair, of shape ``edge_shape``: about as many of each at every variable."""
+        ...
+
     def blocks(self) -> Iterator[slice]:
         """Slices of variables that are not coupled to each other, in order, covering all."""
         ...
@@ -100,6 +104,11 @@ class Bipartite:
         first, second = self.split(x)
         return torch.cat((second @ coupling, first @ coupling.mT), dim=-1)
 
+    def alternating(self) -> Tensor:
+        """A checkerboard."""
+        second, first = torch.arange(self.n_second).unsqueeze(-1), torch.arange(self.n_first)
+        return 1.0 - 2 * ((second + first) % 2)
+
     def blocks(self) -> Iterator[slice]:
         """The two layers."""
         yield slice(0, self.n_first)
@@ -147,6 +156,10 @@ class EdgeList:
         """Couplings times the other end, summed."""
         first, second = self.gather(x)
         return self.scatter(coupling.unsqueeze(-2) * second, coupling.unsqueeze(-2) * first)
+
+    def alternating(self) -> Tensor:
+        """Every other pair of the list."""
+        return 1.0 - 2 * (torch.arange(self.pairs.shape[0], device=self.pairs.device) % 2)
 
     def blocks(self) -> Iterator[slice]:
         """One variable at a time."""

@@ -116,7 +116,11 @@ class WeightedMaxSat:
 
     @staticmethod
     def from_clauses(
-        n: int, clauses: Sequence[Sequence[int]], weights: Sequence[float], offset: float = 0.0
+        n: int,
+        clauses: Sequence[Sequence[int]],
+        weights: Sequence[float],
+        offset: float = 0.0,
+        dtype: torch.dtype = torch.float64,
     ) -> "WeightedMaxSat":
         """Return one problem from literals as in DIMACS: 3 is variable number 3 (the first is 1), -3 its negation.
 
@@ -129,6 +133,7 @@ class WeightedMaxSat:
             clauses: One list of literals a clause.
             weights: One weight >= 0 a clause.
             offset: Added to every energy.
+            dtype: Of the weights.
 
         >>> problem = WeightedMaxSat.from_clauses(3, [[1, 2], [-1], [-1, -2, 3]], [1.0, 2.0, 4.0])
         >>> problem.energy(torch.tensor([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])).tolist()
@@ -149,7 +154,7 @@ class WeightedMaxSat:
         for (literal,), weight in zip(*by_length.pop(1, ([], [])), strict=True):
             wanted[int(literal > 0), abs(literal) - 1] += weight
         always = sum(by_length.pop(0, ([], []))[1]) + float(wanted.min(0).values.sum())
-        pairs = _literal_block(2, *by_length.pop(2, ([], [])))
+        pairs = _literal_block(2, *by_length.pop(2, ([], [])), dtype)
         return WeightedMaxSat(
             graph=EdgeList(n=n, pairs=pairs.variables),
             weight=pairs.weight,
@@ -157,35 +162,45 @@ class WeightedMaxSat:
             second=pairs.polarity[:, 1],
             unit=(wanted[1] - wanted[0]).to(pairs.weight.dtype),
             offset=torch.tensor(offset + always, dtype=torch.float64),
-            longer=tuple(_literal_block(length, *by_length[length]) for length in sorted(by_length)),
+            longer=tuple(_literal_block(length, *by_length[length], dtype) for length in sorted(by_length)),
         )
 
 
-def _literal_block(length: int, clauses: list[list[int]], weights: list[float]) -> Clauses:
+def _literal_block(length: int, clauses: list[list[int]], weights: list[float], dtype: torch.dtype) -> Clauses:
     """Clauses of one length as tensors."""
     literals = torch.tensor(clauses, dtype=torch.int64).reshape(len(clauses), length)
-    weight = torch.tensor(weights, dtype=torch.get_default_dtype())
+    weight = torch.tensor(weights, dtype=dtype)
     return Clauses(variables=literals.abs() - 1, polarity=literals.sign().to(weight.dtype), weight=weight)
 
 
 def from_qubo(qubo: Qubo) -> WeightedMaxSat:
     r"""Return the equivalent weighted MAX-SAT: unsatisfied weight + offset = energy, for every x.
 
-    A coupling J > 0 becomes the clause (not x_i or not x_j) of weight J. A coupling J < 0 becomes
-    (x_i or not x_j) of weight \|J\| and the unit clause (x_j) of weight \|J\|. The unit weights of a
-    variable add up with its linear term; the sign of the sum u picks the literal, and the unsatisfied unit
-    weight is max(u, 0) - u x.
+    A coupling J becomes one clause of weight \|J\| and unit clauses, in either of two ways:
+
+    - J > 0: (not x_i or not x_j); or (x_i or x_j) with the units (not x_i) and (not x_j) of weight J.
+    - J < 0: (x_i or not x_j) with the unit (x_j) of weight \|J\|; or (not x_i or x_j) with (x_i).
+
+    The pairs alternate between the two (``graph.alternating()``), so that the units of a variable cancel up to
+    its field in the spin form and no unit clause outweighs the clauses that oppose it. The unit weights add up
+    with the linear terms; the sign of the sum u picks the literal, and the unsatisfied weight is max(u, 0) - u x.
     """
-    attractive = (-qubo.coupling).clamp(min=0)
-    unit = qubo.graph.scatter(torch.zeros_like(attractive), attractive) - qubo.linear
-    ones = torch.ones_like(qubo.coupling)
+    way = qubo.graph.alternating().to(qubo.coupling)
+    weight = qubo.coupling.abs()
+    second = -way.expand(weight.shape)
+    first = torch.where(qubo.coupling < 0, -second, second)
+    # A literal of polarity q is false as (1 + q) / 2 - q x: what a clause costs beyond J x_i x_j is linear.
+    false_first, false_second = (1 + first) / 2, (1 + second) / 2
+    linear = qubo.graph.scatter(-weight * first * false_second, -weight * second * false_first)
+    constant = (weight * false_first * false_second).double().sum(tuple(range(-len(qubo.graph.edge_shape), 0)))
+    unit = linear - qubo.linear
     return WeightedMaxSat(
         graph=qubo.graph,
-        weight=qubo.coupling.abs(),
-        first=torch.where(qubo.coupling < 0, ones, -ones),
-        second=-ones[(slice(0, 1),) * ones.ndim],
+        weight=weight,
+        first=first,
+        second=second,
         unit=unit,
-        offset=qubo.offset.double() - unit.double().clamp(min=0).sum(-1),
+        offset=qubo.offset.double() - constant - unit.double().clamp(min=0).sum(-1),
     )
 
 

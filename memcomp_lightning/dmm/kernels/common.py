@@ -10,11 +10,8 @@ F32: Final = np.float32
 BOND: Final = 1
 """Kind of field: bond dynamics; clause dynamics is 0."""
 
-LANES: Final = 16
-"""Restarts side by side in the sparse kernel."""
-
 REFRESH: Final = 64
-"""Local fields are summed from scratch each so many steps, which bounds their rounding error."""
+"""Local fields are summed from scratch each so many readings, which bounds their rounding error."""
 
 MAX_SWEEPS: Final = 1000
 """Ends a quench that rounding errors would keep alternating between equal energies."""

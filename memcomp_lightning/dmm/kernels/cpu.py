@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from memcomp_lightning.dmm.bond import BondField, BondMachine
 from memcomp_lightning.dmm.clause import ClauseField, ClauseMachine
 from memcomp_lightning.dmm.integrate import Splitting
 from memcomp_lightning.dmm.kernels import lanes, rows
-from memcomp_lightning.dmm.kernels.common import BOND, LANES
+from memcomp_lightning.dmm.kernels.common import BOND
 from memcomp_lightning.dmm.kernels.run import Run, Start, Visited
 from memcomp_lightning.qubo.graph import Bipartite
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, to_qubo
@@ -35,13 +36,15 @@ def run(
     start: Start,
     *,
     n_steps: int,
-    quench_every: int | None,
+    quench_every: int,
     recording: Recording | None,
 ) -> Run:
     """Do what ``reference.run`` does, for tensors on the CPU, in float32."""
-    steps = (n_steps, quench_every or 0, recording.every if recording is not None else 0)
-    control = np.array([integrator.max_change, integrator.dt_min, integrator.dt_max, field.noise], np.float32)
-    machine = field.build(problem)
+    steps = (n_steps, quench_every, recording.every if recording is not None else 0)
+    machine: Any = field.build(problem)
+    limits = np.array([integrator.max_change, integrator.dt_min, integrator.dt_max, field.noise], np.float32)
+    control = np.tile(limits, (start.voltage.shape[0], 1))
+    control[:, 0] *= _array(field.stability(machine)).reshape(-1)
     constants = _constants(field, machine, start.voltage.shape[0])
     if isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
         return _run_rows(machine, problem, constants, control, start, steps)
@@ -78,22 +81,22 @@ def _run_lanes(
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     n_problems, n_restarts, n = start.voltage.shape
-    n_blocks = -(-n_restarts // LANES)
+    n_blocks, lanes_each = _blocks(n_restarts)
     sparse = _sparse(machine, problem, n_problems)
-    voltage = _to_lanes(_array(start.voltage), n_blocks)
+    voltage = _to_lanes(_array(start.voltage), n_blocks, lanes_each)
     sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
     memories = [
-        _to_lanes(memory, n_blocks)
+        _to_lanes(memory, n_blocks, lanes_each)
         for memory in _memories([(n_problems, n_restarts, size) for size in sizes], start.kept)
     ]
-    seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks)[:, :, 0])
-    out = _outputs((n_problems, n_blocks, LANES), n, steps)
+    seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks, lanes_each)[:, :, 0])
+    out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
-    arrays = (sparse.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
-    arrays = (*arrays, longer, sparse.digital, sparse.linear)
+    own = (sparse.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
+    arrays = (*own, longer, sparse.digital, sparse.linear)
     state = (voltage, *memories, seed)
     _share(lanes.integrate_all, n_problems * n_blocks, (arrays, control, state, steps, *out))
-    out = tuple(x.reshape(n_problems, n_blocks * LANES, *x.shape[3:])[:, :n_restarts] for x in out)
+    out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
     final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
     return _finish(out, final[0], final[1:], steps)
 
@@ -117,18 +120,17 @@ def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -
     """Flatten a problem and list, for each variable, its pairs and its longer clauses."""
     pairs = np.ascontiguousarray(problem.graph.edges().cpu().numpy())
     n, n_pairs = problem.n, pairs.shape[0]
-    clauses = machine if isinstance(machine, ClauseMachine) else None
-    if clauses is None:
+    if isinstance(machine, BondMachine):
         kind, weight, unit = BOND, machine.bond, machine.field
         polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
         variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
         longer_weight = np.zeros((n_problems, 0), np.float32)
     else:
-        kind, weight, unit = 1 - BOND, clauses.weight, clauses.unit
-        both = [q.expand(weight.shape).reshape(n_problems, n_pairs) for q in (clauses.first, clauses.second)]
+        kind, weight, unit = 1 - BOND, machine.weight, machine.unit
+        both = [q.expand(weight.shape).reshape(n_problems, n_pairs) for q in (machine.first, machine.second)]
         polarity = _array(torch.stack(both, dim=-1))
-        variables, longer_polarity = clauses.longer_variables.numpy(), _array(clauses.longer_polarity)
-        longer_weight = _array(clauses.longer_weight.squeeze(-2))
+        variables, longer_polarity = machine.longer_variables.numpy(), _array(machine.longer_polarity)
+        longer_weight = _array(machine.longer_weight.squeeze(-2))
     if isinstance(problem, Qubo):
         quadratic, block_weights = problem, []
     else:
@@ -144,8 +146,8 @@ def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -
     neighbours = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
     literal_clause, literal_at = np.nonzero(longer_polarity)
     clause_order, clause_offsets = _sorted(variables[literal_clause, literal_at], n)
-    digital = (offsets, neighbours, order % max(n_pairs, 1), coupling)
-    digital = (*digital, clause_offsets, literal_clause[clause_order], clause_weight)
+    of_pairs = (offsets, neighbours, order % max(n_pairs, 1), coupling)
+    of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
     return _Sparse(
         kind,
         pairs,
@@ -155,7 +157,7 @@ def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -
         variables,
         longer_polarity,
         longer_weight,
-        digital,
+        (*of_pairs, *of_clauses),
         linear,
     )
 
@@ -169,11 +171,11 @@ def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
 def _constants(field: ClauseField | BondField, machine: Machine, n_problems: int) -> Array:
     """Constants of the field in the order in which the kernels read them, ``(n_problems, 10)``."""
     if isinstance(field, BondField):
-        values = (field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta)
-        values = (*values, field.short_term_min, field.long_term_max, field.short_term_start, 1.0)
+        values = [field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta]
+        values += [field.short_term_min, field.long_term_max, field.short_term_start, 1.0]
     else:
-        values = (field.alpha, field.beta, field.gamma, field.delta, field.epsilon, field.zeta)
-        values = (*values, field.long_term_max, field.unit_pull, 0.0, 1.0)
+        values = [field.alpha, field.beta, field.gamma, field.delta, field.epsilon, field.zeta]
+        values += [field.long_term_max, field.unit_pull, 0.0, 1.0]
     constants = np.tile(np.array(values, np.float32), (n_problems, 1))
     if isinstance(machine, BondMachine):
         constants[:, 9] = _array(machine.pull_scale).reshape(-1)
@@ -222,10 +224,23 @@ def _finish(out: tuple[Array, ...], voltage: Array, memories: list[Array], steps
     return Run(best > 0.5, found_at, torch.from_numpy(voltage), kept, visited)
 
 
-def _to_lanes(x: Array, n_blocks: int) -> Array:
-    """``(n_problems, n_restarts, size)`` as ``(n_problems, n_blocks, size, LANES)``."""
-    restart = np.arange(n_blocks * LANES) % x.shape[1]
-    blocks = x[:, restart].reshape(x.shape[0], n_blocks, LANES, x.shape[2])
+def _blocks(n_restarts: int) -> tuple[int, int]:
+    """Number of blocks of restarts and lanes of each, a multiple of the vector width up to ``_MOST_LANES``."""
+    n_blocks = -(-n_restarts // _MOST_LANES)
+    return n_blocks, -(-n_restarts // (n_blocks * _VECTOR)) * _VECTOR
+
+
+_VECTOR = 16
+"""float32 numbers in the longest vector register of present processors."""
+
+_MOST_LANES = 32
+"""Enough to hide the cost of a loop over the lanes, few enough to keep a variable's numbers close together."""
+
+
+def _to_lanes(x: Array, n_blocks: int, lanes_each: int) -> Array:
+    """``(n_problems, n_restarts, size)`` as ``(n_problems, n_blocks, size, lanes_each)``."""
+    restart = np.arange(n_blocks * lanes_each) % x.shape[1]
+    blocks = x[:, restart].reshape(x.shape[0], n_blocks, lanes_each, x.shape[2])
     return np.ascontiguousarray(blocks.transpose(0, 1, 3, 2))
 
 
@@ -251,7 +266,7 @@ def _share(kernel: Callable[..., None], n_items: int, arguments: tuple[Any, ...]
     cuts = np.linspace(0, n_items, min(n_items, 4 * n_threads) + 1).astype(int).tolist()
     if not kernel.signatures:  # type: ignore[attr-defined]
         kernel(0, 0, *arguments)
-    jobs = [_pool(n_threads).submit(kernel, a, b, *arguments) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    jobs = [_pool(n_threads).submit(kernel, a, b, *arguments) for a, b in pairwise(cuts)]
     for job in jobs:
         job.result()
 

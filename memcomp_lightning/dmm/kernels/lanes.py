@@ -1,12 +1,12 @@
 """Compiled kernel for listed pairs and longer clauses: vectors run along the restarts.
 
-One call integrates ``LANES`` restarts side by side, so that a sparse problem needs no gathers: every number of
-a variable or a clause is a vector over the restarts. Time and memory are linear in the number of pairs. All
-arrays are float32 with the lanes last; each lane has a step size of its own. The equations are those of
-``ClauseField`` and ``BondField``, the scheme is ``Splitting``.
+One call integrates a block of restarts, its lanes, side by side, so that a sparse problem needs no gathers: every
+number of a variable or a clause is a vector over the restarts. Time and memory are linear in the number of
+pairs. All arrays are float32 with the lanes last; each lane has a step size of its own. The equations are those
+of ``ClauseField`` and ``BondField``, the scheme is ``Splitting``.
 
-The inner loops are split so that each writes one array: the compiler then needs few overlap checks to turn
-them into vector code.
+The passes over the pairs read flat arrays at unsigned offsets, in loops over the lanes that write one array
+each: only then does the compiler make vector code of them.
 """
 
 import math
@@ -14,63 +14,100 @@ import math
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.dmm.kernels.common import BOND, F32, FAST_MATH, LANES, MAX_SWEEPS, REFRESH, uniform
+from memcomp_lightning.dmm.kernels.common import BOND, F32, FAST_MATH, MAX_SWEEPS, REFRESH, uniform
+
+U64 = np.uint64
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def clause_pass(pairs, weight, polarity, memory, voltage, drive, push, c, dt):
-    """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive.
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
+    """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive to ``rate``.
 
-    ``memory`` holds x_s + epsilon and x_l - 1 of each pair, ``(n_pairs, 2 LANES)``; ``push`` is scratch.
+    ``memory`` holds x_s + epsilon and x_l - 1 of each pair, ``(n_pairs, 2, lanes)``; ``push`` is scratch.
     """
     zero, half, one = F32(0), F32(0.5), F32(1)
     alpha, beta, gamma, delta, epsilon, zeta, cap = c[0], c[1], c[2], c[3], c[4], c[5], c[6] - one
     top, stiff = one + epsilon, one + zeta
+    lanes = U64(dt.size)
+    m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
     for e in range(weight.size):
         w = weight[e]
         first, second = polarity[e, 0], polarity[e, 1]
-        a, b, m = voltage[pairs[e, 0]], voltage[pairs[e, 1]], memory[e]
-        for k in range(LANES):
-            false_first, false_second = half - half * first * a[k], half - half * second * b[k]
+        a, b, short = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, U64(2 * e) * lanes
+        long = short + lanes
+        for k in range(lanes):
+            false_first, false_second = half - half * first * v[a + k], half - half * second * v[b + k]
             unsatisfied = min(false_first, false_second)
-            s = min(top, max(epsilon, m[k] * (one + dt[k] * beta * (unsatisfied - gamma))))
-            x = m[LANES + k]
+            s = min(top, max(epsilon, m[short + k] * (one + dt[k] * beta * (unsatisfied - gamma))))
+            x = m[long + k]
             excess = dt[k] * alpha * (unsatisfied - delta)
             x = min(cap, x + excess * (one if excess > zero else x))
-            m[k] = s
-            m[LANES + k] = x
+            m[short + k] = s
+            m[long + k] = x
             agile = w * (s - epsilon)
             gradient = agile + agile * x
             rigidity = (w - agile) * unsatisfied * (stiff + zeta * x)
             at_first = rigidity if false_first <= false_second else zero
             push[k] = first * (gradient * false_second + at_first)
-            push[LANES + k] = second * (gradient * false_first + (rigidity - at_first))
-        add(drive[pairs[e, 0]], push[:LANES])
-        add(drive[pairs[e, 1]], push[LANES:])
+            push[lanes + k] = second * (gradient * false_first + (rigidity - at_first))
+        a, b = a + a, b + b
+        for k in range(lanes):
+            r[a + k] += push[k]
+        for k in range(lanes):
+            r[b + k] += push[lanes + k]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
+    """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
+
+    ``memory`` holds X and Y - 1 of each bond, ``rate`` the drive and the pull of each spin, ``(..., 2, lanes)``.
+    """
+    zero, one = F32(0), F32(1)
+    gamma, kappa, delta, zeta, low, cap = c[2], c[3], c[4], c[5], c[6], c[7] - one
+    lift = gamma - one
+    lanes = U64(dt.size)
+    m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
+    for e in range(bond.size):
+        w = bond[e]
+        size = abs(w)
+        satisfied = gamma * kappa * (one if w > zero else (-one if w < zero else zero))
+        a, b, short = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, U64(2 * e) * lanes
+        long = short + lanes
+        for k in range(lanes):
+            x, y = m[short + k], m[long + k]
+            m[long + k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
+            x = min(one, max(low, x + dt[k] * (lift - y + satisfied * (v[a + k] * v[b + k]))))
+            m[short + k] = x
+            push[k] = size * x
+        drive_a, drive_b = a + a, b + b
+        for k in range(lanes):
+            r[drive_a + k] += w * v[b + k]
+        for k in range(lanes):
+            r[drive_b + k] += w * v[a + k]
+        pull_a, pull_b = drive_a + lanes, drive_b + lanes
+        for k in range(lanes):
+            r[pull_a + k] += push[k]
+        for k in range(lanes):
+            r[pull_b + k] += push[k]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def add(total, part):
-    """``total += part`` over the lanes."""
-    for k in range(LANES):
-        total[k] += part[k]
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def longer_pass(variables, polarity, weight, memory, voltage, drive, falsehood, c, dt):
+def longer_pass(variables, polarity, weight, memory, voltage, rate, falsehood, c, dt):
     """The same for clauses of three literals and more, padded with polarity 0; ``falsehood`` is scratch."""
     zero, half, one = F32(0), F32(0.5), F32(1)
     alpha, beta, gamma, delta, epsilon, zeta, cap = c[0], c[1], c[2], c[3], c[4], c[5], c[6] - one
+    lanes = dt.size
     for e in range(weight.size):
-        w, m = weight[e], memory[e]
+        w = weight[e]
         length = 0
         while length < variables.shape[1] and polarity[e, length] != 0:
             length += 1
         for i in range(length):
-            v, q, f = voltage[variables[e, i]], polarity[e, i], falsehood[i]
-            for k in range(LANES):
-                f[k] = half - half * q * v[k]
-        for k in range(LANES):
+            variable, q = variables[e, i], polarity[e, i]
+            for k in range(lanes):
+                falsehood[i, k] = half - half * q * voltage[variable, k]
+        for k in range(lanes):
             smallest, next_smallest, at = F32(2), F32(2), 0
             for i in range(length):
                 f = falsehood[i, k]
@@ -78,66 +115,33 @@ def longer_pass(variables, polarity, weight, memory, voltage, drive, falsehood, 
                     smallest, next_smallest, at = f, smallest, i
                 elif f < next_smallest:
                     next_smallest = f
-            s = min(one + epsilon, max(epsilon, m[k] * (one + dt[k] * beta * (smallest - gamma))))
-            x = m[LANES + k]
+            s = min(one + epsilon, max(epsilon, memory[e, 0, k] * (one + dt[k] * beta * (smallest - gamma))))
+            x = memory[e, 1, k]
             excess = dt[k] * alpha * (smallest - delta)
             x = min(cap, x + excess * (one if excess > zero else x))
-            m[k] = s
-            m[LANES + k] = x
+            memory[e, 0, k] = s
+            memory[e, 1, k] = x
             agile = w * (s - epsilon)
             gradient = agile + agile * x
             rigidity = (w - agile) * smallest * (one + zeta + zeta * x)
             for i in range(length):
                 push = gradient * next_smallest + rigidity if i == at else gradient * smallest
-                drive[variables[e, i], k] += polarity[e, i] * push
+                rate[variables[e, i], 0, k] += polarity[e, i] * push
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def clause_units(unit, long, voltage, drive, c, dt):
+def clause_units(unit, long, voltage, rate, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
     alpha, delta, cap, strength = c[0], c[3], c[6] - one, c[7]
     for i in range(unit.size):
         u = unit[i]
         sign = half if u > 0 else (-half if u < 0 else F32(0))
-        v, d, m = voltage[i], drive[i], long[i]
-        for k in range(LANES):
-            excess = dt[k] * alpha * (half - sign * v[k] - delta)
-            m[k] = min(cap, m[k] + excess * (one if excess > 0 else m[k]))
-        for k in range(LANES):
-            d[k] += strength * u * (one + m[k])
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
-    """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
-
-    ``memory`` holds X and Y - 1 of each bond, ``rate`` the drive and the pull of each spin, 2 LANES each.
-    """
-    zero, one = F32(0), F32(1)
-    gamma, kappa, delta, zeta, low, cap = c[2], c[3], c[4], c[5], c[6], c[7] - one
-    lift = gamma - one
-    for e in range(bond.size):
-        w = bond[e]
-        size = abs(w)
-        satisfied = gamma * kappa * (one if w > zero else (-one if w < zero else zero))
-        a, b, m = voltage[pairs[e, 0]], voltage[pairs[e, 1]], memory[e]
-        for k in range(LANES):
-            x, y = m[k], m[LANES + k]
-            m[LANES + k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
-            x = min(one, max(low, x + dt[k] * (lift - y + satisfied * (a[k] * b[k]))))
-            m[k] = x
-            push[k] = size * x
-        strain(rate[pairs[e, 0]], b, push, w)
-        strain(rate[pairs[e, 1]], a, push, w)
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def strain(rate, other, strength, w):
-    """Add a bond's drive and pull to one of its spins."""
-    for k in range(LANES):
-        rate[k] += w * other[k]
-        rate[LANES + k] += strength[k]
+        for k in range(dt.size):
+            excess = dt[k] * alpha * (half - sign * voltage[i, k] - delta)
+            long[i, k] = min(cap, long[i, k] + excess * (one if excess > 0 else long[i, k]))
+        for k in range(dt.size):
+            rate[i, 0, k] += strength * u * (one + long[i, k])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -150,13 +154,13 @@ def bond_fields(field, short, long, voltage, rate, c, dt):
         h = field[i]
         size = abs(h)
         sign = one if h > zero else (-one if h < zero else zero)
-        v, r, s, m = voltage[i], rate[i], short[i], long[i]
-        for k in range(LANES):
-            x, y = s[k], m[k]
-            m[k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
-            s[k] = min(one, max(low, x + dt[k] * (gamma * (one + kappa * sign * v[k]) - one - y)))
-        for k in range(LANES):
-            r[k] = alpha * (r[k] + h) - pull_rate * (r[LANES + k] + size * s[k]) * v[k]
+        for k in range(dt.size):
+            x, y = short[i, k], long[i, k]
+            long[i, k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
+            short[i, k] = min(one, max(low, x + dt[k] * (gamma * (one + kappa * sign * voltage[i, k]) - one - y)))
+        for k in range(dt.size):
+            pull = rate[i, 1, k] + size * short[i, k]
+            rate[i, 0, k] = alpha * (rate[i, 0, k] + h) - pull_rate * pull * voltage[i, k]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -192,51 +196,103 @@ def flip(digital, x, field, true, i, k):
     return gain
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def local_fields(digital, linear, pairs, x, field, true, k):
-    """Write the local fields of lane ``k`` from scratch; return its energy."""
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def local_fields(digital, linear, pairs, x, field, true, energy):
+    """Write the local fields and the energies of all lanes from scratch."""
     coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
     half = F32(0.5)
-    energy = 0.0
-    for i in range(linear.size):
-        field[i, k] = linear[i]
-        energy += linear[i] * x[i, k]
+    n, lanes = U64(linear.size), U64(x.shape[1])
+    f, y = field.ravel(), x.ravel()
+    for i in range(n):
+        for k in range(lanes):
+            f[i * lanes + k] = linear[i]
     for e in range(coupling.size):
-        a, b = pairs[e, 0], pairs[e, 1]
-        field[a, k] += coupling[e] * x[b, k]
-        field[b, k] += coupling[e] * x[a, k]
-        energy += coupling[e] * x[a, k] * x[b, k]
+        w = coupling[e]
+        a, b = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes
+        for k in range(lanes):
+            f[a + k] += w * y[b + k]
+        for k in range(lanes):
+            f[b + k] += w * y[a + k]
+    energy[:] = 0
+    for i in range(n):
+        for k in range(lanes):
+            energy[k] += half * y[i * lanes + k] * (linear[i] + f[i * lanes + k])
     for clause in range(weight.size):
-        count = 0
-        for j in range(variables.shape[1]):
-            sign = polarity[clause, j]
-            if sign != 0 and (sign > 0) == (x[variables[clause, j], k] > half):
-                count += 1
-        true[clause, k] = count
-        if count == 0:
-            energy += weight[clause]
-        for j in range(variables.shape[1]):
-            sign = polarity[clause, j]
-            if sign != 0:
-                holds = 1 if (sign > 0) == (x[variables[clause, j], k] > half) else 0
-                if count == holds:
-                    field[variables[clause, j], k] -= sign * weight[clause]
-    return energy
+        for k in range(x.shape[1]):
+            count = 0
+            for j in range(variables.shape[1]):
+                sign = polarity[clause, j]
+                if sign != 0 and (sign > 0) == (x[variables[clause, j], k] > half):
+                    count += 1
+            true[clause, k] = count
+            if count == 0:
+                energy[k] += weight[clause]
+            for j in range(variables.shape[1]):
+                sign = polarity[clause, j]
+                if sign != 0:
+                    holds = 1 if (sign > 0) == (x[variables[clause, j], k] > half) else 0
+                    if count == holds:
+                        field[variables[clause, j], k] -= sign * weight[clause]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def quench(digital, x, field, true):
-    """Flip single variables of one lane as long as each flip lowers the energy; return the change."""
-    total = 0.0
+def quench(digital, x, field, true, energy):
+    """Flip single variables of every lane as long as each flip lowers its energy."""
+    half = F32(0.5)
     for _ in range(MAX_SWEEPS):
         moving = False
         for i in range(x.shape[0]):
-            if (field[i, 0] < 0) if x[i, 0] < F32(0.5) else (field[i, 0] > 0):
-                total += flip(digital, x, field, true, i, 0)
+            # Most variables rest in all lanes: a vector comparison finds that out.
+            eager = 0
+            for k in range(x.shape[1]):
+                eager += 1 if (F32(1) - F32(2) * x[i, k]) * field[i, k] < 0 else 0
+            if eager > 0:
                 moving = True
+                for k in range(x.shape[1]):
+                    if (field[i, k] < 0) if x[i, k] < half else (field[i, k] > 0):
+                        energy[k] += flip(digital, x, field, true, i, k)
         if not moving:
             break
-    return total
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def read_out(digital, linear, pairs, voltage, x, field, true, energy):
+    """Bring the digital states, their fields and energies up to the voltages; return how many bits changed."""
+    half = F32(0.5)
+    n, lanes = x.shape
+    n_changed = 0
+    for i in range(n):
+        for k in range(lanes):
+            n_changed += 1 if (voltage[i, k] > 0) != (x[i, k] > half) else 0
+    if n_changed * MANY > n * lanes and true.size == 0:
+        for i in range(n):
+            for k in range(lanes):
+                x[i, k] = F32(1) if voltage[i, k] > 0 else F32(0)
+        local_fields(digital, linear, pairs, x, field, true, energy)
+    elif n_changed > 0:
+        for i in range(n):
+            here = 0
+            for k in range(lanes):
+                here += 1 if (voltage[i, k] > 0) != (x[i, k] > half) else 0
+            if here > 0:
+                for k in range(lanes):
+                    if (voltage[i, k] > 0) != (x[i, k] > half):
+                        energy[k] += flip(digital, x, field, true, i, k)
+    return n_changed
+
+
+MANY = 30
+"""Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def keep_best(x, energy, lowest, found_at, best, step):
+    """Remember the states that are the lowest of their lane so far."""
+    for k in range(energy.size):
+        if energy[k] < lowest[k]:
+            lowest[k], found_at[k] = energy[k], step
+            for i in range(x.shape[0]):
+                best[k, i] = x[i, k]
 
 
 @njit(nogil=True, cache=True)
@@ -248,13 +304,13 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
         end: Behind the last block.
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
-        control: (max_change, dt_min, dt_max, noise).
-        start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., LANES)``, and the seed.
+        control: (max_change, dt_min, dt_max, noise), a problem each.
+        start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed.
         steps: (n_steps, quench_every, record_every), 0 for never.
-        best: Out, ``(n_problems, n_blocks, LANES, n)``.
-        found_at: Out, ``(n_problems, n_blocks, LANES)``.
-        times: Out, ``(n_problems, n_blocks, LANES, n_records)``.
-        states: Out, ``(n_problems, n_blocks, LANES, n_records, n)``.
+        best: Out, ``(n_problems, n_blocks, lanes, n)``.
+        found_at: Out, ``(n_problems, n_blocks, lanes)``.
+        times: Out, ``(n_problems, n_blocks, lanes, n_records)``.
+        states: Out, ``(n_problems, n_blocks, lanes, n_records, n)``.
     """
     kind, constants, pairs, weight, polarity, unit, longer, digital, linear = problem
     variables, longer_polarity, longer_weight = longer
@@ -265,10 +321,20 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
         p, b = item // n_blocks, item % n_blocks
         found_at[p, b] = integrate(
             (kind, pairs, weight[p], polarity[p], unit[p], variables, longer_polarity, longer_weight[p]),
-            (offsets, neighbour, edge, coupling[p], in_clause, clause_of, variables, longer_polarity, clause_weight[p]),
+            (
+                offsets,
+                neighbour,
+                edge,
+                coupling[p],
+                in_clause,
+                clause_of,
+                variables,
+                longer_polarity,
+                clause_weight[p],
+            ),
             linear[p],
             constants[p],
-            control,
+            control[p],
             (voltage[p, b], long[p, b], unit_long[p, b], longer_long[p, b], seed[p, b]),
             steps,
             best[p, b],
@@ -279,7 +345,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
 def integrate(problem, digital, linear, c, control, start, steps, best, times, states):
-    """Integrate LANES restarts; return the step at which each one's ``best`` was met, 0 for the initial state.
+    """Integrate the lanes of a block; return the step at which each one's ``best`` was met, 0 for the start.
 
     Args:
         problem: (kind, pairs, weight or bond, polarity, unit or field, variables, polarity and weight of the
@@ -287,75 +353,71 @@ def integrate(problem, digital, linear, c, control, start, steps, best, times, s
         digital: What ``flip`` needs.
         linear: ``(n,)``, of the energy.
         c: Constants of the field, in the order of ``cpu._constants``.
-        control: (max_change, dt_min, dt_max, noise).
+        control: (max_change, dt_min, dt_max, noise), a problem each.
         start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
-        steps: (n_steps, quench_every, record_every).
-        best: ``(LANES, n)``, out: the assignments of lowest energy.
-        times: ``(LANES, n_records)``, out.
-        states: ``(LANES, n_records, n)``, out.
+        steps: (n_steps, quench_every, record_every); quench_every = 0 reads each step without a quench.
+        best: ``(lanes, n)``, out: the assignments of lowest energy.
+        times: ``(lanes, n_records)``, out.
+        states: ``(lanes, n_records, n)``, out.
     """
     kind, pairs, weight, polarity, unit, longer_variables, longer_polarity, longer_weight = problem
     voltage, long, unit_long, longer_long, seeds = start
     n_steps, quench_every, every = steps
     half, one = F32(0.5), F32(1)
-    n, n_pairs, n_longer = unit.size, weight.size, longer_weight.size
-    rate, push = np.zeros((n, 2 * LANES), F32), np.empty(2 * LANES, F32)
-    memory, longer_memory = np.empty((n_pairs, 2 * LANES), F32), np.empty((n_longer, 2 * LANES), F32)
-    unit_short = np.full((n, LANES), c[8], F32)
-    falsehood = np.empty((longer_variables.shape[1], LANES), F32)
+    n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
+    rate, push = np.zeros((n, 2, lanes), F32), np.empty(2 * lanes, F32)
+    memory, longer_memory = np.empty((n_pairs, 2, lanes), F32), np.empty((n_longer, 2, lanes), F32)
+    unit_short = np.full((n, lanes), c[8], F32)
+    falsehood = np.empty((longer_variables.shape[1], lanes), F32)
     for e in range(n_pairs):
-        for k in range(LANES):
+        for k in range(lanes):
             false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
             false_second = half - half * polarity[e, 1] * voltage[pairs[e, 1], k]
-            memory[e, k] = c[8] if kind == BOND else c[4] + min(false_first, false_second)
-            memory[e, LANES + k] = long[e, k]
+            memory[e, 0, k] = c[8] if kind == BOND else c[4] + min(false_first, false_second)
+            memory[e, 1, k] = long[e, k]
     for e in range(n_longer):
-        for k in range(LANES):
+        for k in range(lanes):
             smallest = one
             for j in range(longer_variables.shape[1]):
-                if longer_polarity[e, j] != 0:
-                    smallest = min(smallest, half - half * longer_polarity[e, j] * voltage[longer_variables[e, j], k])
-            longer_memory[e, k] = c[4] + smallest
-            longer_memory[e, LANES + k] = longer_long[e, k]
-    x, field, true = np.empty((n, LANES), F32), np.empty((n, LANES), F32), np.zeros((n_longer, LANES), np.int32)
-    tried, tried_field, tried_true = np.empty((n, 1), F32), np.empty((n, 1), F32), np.zeros((n_longer, 1), np.int32)
-    energy, lowest, found_at = np.zeros(LANES), np.full(LANES, np.inf), np.zeros(LANES, np.int64)
-    elapsed = np.zeros(LANES)
-    dt, fastest, changed = np.zeros(LANES, F32), np.empty(LANES, F32), np.ones(LANES, np.bool_)
-    for k in range(LANES):
-        for i in range(n):
+                sign = longer_polarity[e, j]
+                if sign != 0:
+                    smallest = min(smallest, half - half * sign * voltage[longer_variables[e, j], k])
+            longer_memory[e, 0, k] = c[4] + smallest
+            longer_memory[e, 1, k] = longer_long[e, k]
+    x, field, true = np.empty((n, lanes), F32), np.empty((n, lanes), F32), np.zeros((n_longer, lanes), np.int32)
+    tried, tried_field, tried_true = np.empty_like(x), np.empty_like(field), np.empty_like(true)
+    energy, reached = np.zeros(lanes), np.zeros(lanes)
+    lowest, found_at = np.full(lanes, np.inf), np.zeros(lanes, np.int64)
+    elapsed, dt, fastest = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
+    for i in range(n):
+        for k in range(lanes):
             x[i, k] = one if voltage[i, k] > 0 else F32(0)
-        energy[k] = local_fields(digital, linear, pairs, x, field, true, k)
-    counter = np.uint64(0)
+    local_fields(digital, linear, pairs, x, field, true, energy)
+    n_changed, n_reads, counter = 1, 0, U64(0)
     for step in range(n_steps + 1):
-        if step > 0:
-            for i in range(n):
-                for k in range(LANES):
-                    if (voltage[i, k] > 0) != (x[i, k] > half):
-                        energy[k] += flip(digital, x, field, true, i, k)
-                        changed[k] = True
-            if step % REFRESH == 0:
-                for k in range(LANES):
-                    energy[k] = local_fields(digital, linear, pairs, x, field, true, k)
-        for k in range(LANES):
-            if changed[k] and energy[k] < lowest[k]:
-                lowest[k], found_at[k] = energy[k], step
-                best[k] = x[:, k]
-            if changed[k] and quench_every > 0 and step % quench_every == 0:
-                tried[:, 0] = x[:, k]
-                tried_field[:, 0] = field[:, k]
-                tried_true[:, 0] = true[:, k]
-                reached = energy[k] + quench(digital, tried, tried_field, tried_true)
-                if reached < lowest[k]:
-                    lowest[k], found_at[k] = reached, step
-                    best[k] = tried[:, 0]
-                changed[k] = False
-            if every > 0 and step > 0 and step % every == 0:
-                at = step // every - 1
-                times[k, at] = elapsed[k]
+        recorded = every > 0 and step > 0 and step % every == 0
+        reads = quench_every == 0 or step % quench_every == 0
+        if step > 0 and (reads or recorded):
+            n_changed += read_out(digital, linear, pairs, voltage, x, field, true, energy)
+            n_reads += 1
+            if n_reads % REFRESH == 0:
+                local_fields(digital, linear, pairs, x, field, true, energy)
+        if reads:
+            keep_best(x, energy, lowest, found_at, best, step)
+        if reads and n_changed > 0 and quench_every > 0:
+            tried[:] = x
+            tried_field[:] = field
+            tried_true[:] = true
+            reached[:] = energy
+            quench(digital, tried, tried_field, tried_true, reached)
+            keep_best(tried, reached, lowest, found_at, best, step)
+            n_changed = 0
+        if recorded:
+            for k in range(lanes):
+                times[k, step // every - 1] = elapsed[k]
                 for i in range(n):
-                    states[k, at, i] = x[i, k] > half
+                    states[k, step // every - 1, i] = x[i, k] > half
         # One pass moves the memories by the step that led here and finds the rate of the voltages.
         rate[:] = 0
         if kind == BOND:
@@ -371,22 +433,26 @@ def integrate(problem, digital, linear, c, control, start, steps, best, times, s
             break
         fastest[:] = F32(1e-30)
         for i in range(n):
-            for k in range(LANES):
-                fastest[k] = max(fastest[k], abs(rate[i, k]))
-        for k in range(LANES):
+            for k in range(lanes):
+                fastest[k] = max(fastest[k], abs(rate[i, 0, k]))
+        for k in range(lanes):
             dt[k] = min(control[2], max(control[1], control[0] / fastest[k]))
             elapsed[k] += dt[k]
         for i in range(n):
-            for k in range(LANES):
-                shake = F32(0)
-                if control[3] > 0:
-                    shake = control[3] * math.sqrt(dt[k]) * uniform(seeds[k], counter)
-                voltage[i, k] = min(one, max(-one, voltage[i, k] + dt[k] * rate[i, k] + shake))
-            counter += np.uint64(1)
+            for k in range(lanes):
+                voltage[i, k] += dt[k] * rate[i, 0, k]
+        if control[3] > 0:
+            for i in range(n):
+                for k in range(lanes):
+                    voltage[i, k] += control[3] * math.sqrt(dt[k]) * uniform(seeds[k], counter + U64(i))
+            counter += U64(n)
+        for i in range(n):
+            for k in range(lanes):
+                voltage[i, k] = min(one, max(-one, voltage[i, k]))
     for e in range(n_pairs):
-        for k in range(LANES):
-            long[e, k] = memory[e, LANES + k]
+        for k in range(lanes):
+            long[e, k] = memory[e, 1, k]
     for e in range(n_longer):
-        for k in range(LANES):
-            longer_long[e, k] = longer_memory[e, LANES + k]
+        for k in range(lanes):
+            longer_long[e, k] = longer_memory[e, 1, k]
     return found_at

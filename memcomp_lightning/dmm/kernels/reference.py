@@ -22,7 +22,7 @@ def run(
     start: Start,
     *,
     n_steps: int,
-    quench_every: int | None,
+    quench_every: int,
     recording: Recording | None,
 ) -> Run:
     """Integrate for ``n_steps`` steps and keep the best assignment met.
@@ -33,7 +33,8 @@ def run(
         problem: With one axis of problems.
         start: Where each restart begins.
         n_steps: Steps a restart.
-        quench_every: Descend by single flips from a copy of the digital state each so many steps.
+        quench_every: Read the digital state each so many steps, and descend from a copy of it by single flips; 0
+            reads it at each step, without a descent.
         recording: Which records to keep.
     """
     machine = field.build(problem)
@@ -50,15 +51,13 @@ def run(
             state = _shaken(field.noise, state, dt, start.seed, step - 1)
             time = time + dt
         x = state.voltage > 0
-        energy = problem.energy(x)
-        candidates = [(x, energy)]
-        if quench_every is not None and step % quench_every == 0:
-            quenched = quench(problem, x)
-            candidates.append((quenched, problem.energy(quenched)))
-        for candidate, its_energy in candidates:
-            better = its_energy < best_energy
+        if quench_every == 0 or step % quench_every == 0:
+            # A descent ends at or below its start: its end alone need be compared.
+            candidate = quench(problem, x) if quench_every else x
+            energy = problem.energy(candidate)
+            better = energy < best_energy
             best = torch.where(better.unsqueeze(-1), candidate, best)
-            best_energy = torch.minimum(its_energy, best_energy)
+            best_energy = torch.minimum(energy, best_energy)
             found_at = torch.where(better, step, found_at)
         if recording is not None and step > 0 and step % recording.every == 0:
             times.append(time)

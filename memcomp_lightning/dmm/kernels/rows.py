@@ -14,11 +14,11 @@ from memcomp_lightning.dmm.kernels.common import BOND, F32, FAST_MATH, MAX_SWEEP
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def clause_pass(weight, short, long, voltage, drive, c, dt):
+def clause_pass(weight, board, short, long, voltage, drive, c, dt):
     """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive.
 
-    ``weight`` carries the polarity of the first literal as its sign, the second literal is negated; ``short``
-    holds x_s + epsilon and ``long`` x_l - 1.
+    ``weight`` carries the polarity of the first literal as its sign; that of the second is a checkerboard,
+    -(-1)^(i + j). ``short`` holds x_s + epsilon and ``long`` x_l - 1.
     """
     zero, half, one = F32(0), F32(0.5), F32(1)
     alpha, beta, gamma, delta, epsilon, zeta, cap = c[0], c[1], c[2], c[3], c[4], c[5], c[6] - one
@@ -28,13 +28,15 @@ def clause_pass(weight, short, long, voltage, drive, c, dt):
     top, stiff = one + epsilon, one + zeta
     v, d = voltage[:n_first], drive[:n_first]
     for i in range(n_second):
-        false_second = half + half * voltage[n_first + i]
+        parity = one if i % 2 == 0 else -one
+        tilt = parity * half * voltage[n_first + i]
         push = zero
         w_row, short_row, long_row = weight[i], short[i], long[i]
         for j in range(n_first):
             w = w_row[j]
             sign = math.copysign(one, w)
             false_first = half - sign * (half * v[j])
+            false_second = half + board[j] * tilt
             unsatisfied = min(false_first, false_second)
             s = min(top, max(epsilon, short_row[j] * (keep + growth * unsatisfied)))
             x = long_row[j]
@@ -48,8 +50,8 @@ def clause_pass(weight, short, long, voltage, drive, c, dt):
             rigidity = (size - agile) * unsatisfied * (stiff + zeta * x)
             at_first = rigidity if false_first <= false_second else zero
             d[j] += sign * (gradient * false_second + at_first)
-            push -= gradient * false_first + (rigidity - at_first)
-        drive[n_first + i] += push
+            push -= board[j] * (gradient * false_first + (rigidity - at_first))
+        drive[n_first + i] += parity * push
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -58,12 +60,12 @@ def clause_units(unit, long, voltage, drive, c, dt):
     half, one = F32(0.5), F32(1)
     alpha, delta, cap, pull = c[0], c[3], c[6] - one, c[7]
     for i in range(unit.size):
-        excess = dt * alpha * (half - math.copysign(half, unit[i]) * voltage[i] - delta)
-        if unit[i] == 0:
-            excess = dt * alpha * (half - delta)
+        u = unit[i]
+        sign = half if u > 0 else (-half if u < 0 else F32(0))
+        excess = dt * alpha * (half - sign * voltage[i] - delta)
         x = long[i]
         long[i] = min(cap, x + excess * (one if excess > 0 else x))
-        drive[i] += pull * unit[i] * (one + long[i])
+        drive[i] += pull * u * (one + long[i])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -186,7 +188,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
         begin: First restart.
         end: Behind the last restart.
         problem: (kind, constants, weight, unit, coupling, transposed, linear), the last six a problem each.
-        control: (max_change, dt_min, dt_max, noise).
+        control: (max_change, dt_min, dt_max, noise), a problem each.
         start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``.
         steps: (n_steps, quench_every, record_every), 0 for never.
         best: Out, ``(n_problems, n_restarts, n)``.
@@ -202,7 +204,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
         found_at[p, r] = integrate(
             (kind, weight[p], unit[p], coupling[p], transposed[p], linear[p]),
             constants[p],
-            control,
+            control[p],
             voltage[p, r],
             long[p, r],
             unit_long[p, r],
@@ -226,7 +228,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
         long: Long-term memories ``(n_second, n_first)`` less 1, in and out.
         unit_long: Those of the unit clauses or fields, ``(n,)``, in and out.
         seed: Of the noise.
-        steps: (n_steps, quench_every, record_every).
+        steps: (n_steps, quench_every, record_every); quench_every = 0 reads each step without a quench.
         best: ``(n,)``, out: the assignment of lowest energy.
         times: ``(n_records,)``, out.
         states: ``(n_records, n)``, out.
@@ -238,9 +240,13 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
     n = n_first + n_second
     drive, pull = np.zeros(n, F32), np.zeros(n, F32)
     short, unit_short = np.empty((n_second, n_first), F32), np.full(n, c[8], F32)
+    board = np.empty(n_first, F32)
+    for j in range(n_first):
+        board[j] = one if j % 2 == 0 else -one
     for i in range(n_second):
-        false_second = half + half * voltage[n_first + i]
+        tilt = (one if i % 2 == 0 else -one) * half * voltage[n_first + i]
         for j in range(n_first):
+            false_second = half + board[j] * tilt
             false_first = half - math.copysign(half, weight[i, j]) * voltage[j]
             short[i, j] = c[8] if kind == BOND else c[4] + min(false_first, false_second)
     x, field = np.empty(n, F32), np.empty(n, F32)
@@ -249,19 +255,26 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
         x[i] = one if voltage[i] > 0 else F32(0)
     energy = local_fields(coupling, linear, x, field)
     lowest, found_at, elapsed = np.inf, 0, 0.0
-    dt, changed, counter = F32(0), True, np.uint64(0)
+    dt, changed, n_reads, counter = F32(0), True, 0, np.uint64(0)
     for step in range(n_steps + 1):
-        if step > 0:
+        recorded = every > 0 and step > 0 and step % every == 0
+        reads = quench_every == 0 or step % quench_every == 0
+        if step > 0 and (reads or recorded):
+            n_changed = 0
             for i in range(n):
-                if (voltage[i] > 0) != (x[i] > half):
-                    energy += flip(coupling, transposed, x, field, i)
-                    changed = True
-            if step % REFRESH == 0:
+                n_changed += 1 if (voltage[i] > 0) != (x[i] > half) else 0
+            if n_changed > 0:
+                changed = True
+                for i in range(n):
+                    if (voltage[i] > 0) != (x[i] > half):
+                        energy += flip(coupling, transposed, x, field, i)
+            n_reads += 1
+            if n_reads % REFRESH == 0:
                 energy = local_fields(coupling, linear, x, field)
-        if changed and energy < lowest:
+        if reads and changed and energy < lowest:
             lowest, found_at = energy, step
             best[:] = x
-        if changed and quench_every > 0 and step % quench_every == 0:
+        if reads and changed and quench_every > 0:
             tried[:] = x
             tried_field[:] = field
             reached = energy + quench(coupling, transposed, tried, tried_field)
@@ -269,7 +282,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
                 lowest, found_at = reached, step
                 best[:] = tried
             changed = False
-        if every > 0 and step > 0 and step % every == 0:
+        if recorded:
             times[step // every - 1] = elapsed
             for i in range(n):
                 states[step // every - 1, i] = x[i] > half
@@ -280,7 +293,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
             bond_pass(weight, short, long, voltage, drive, pull, c, dt)
             bond_fields(unit, unit_short, unit_long, voltage, drive, pull, c, dt)
         else:
-            clause_pass(weight, short, long, voltage, drive, c, dt)
+            clause_pass(weight, board, short, long, voltage, drive, c, dt)
             clause_units(unit, unit_long, voltage, drive, c, dt)
         if step == n_steps:
             break
@@ -288,10 +301,14 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
         for i in range(n):
             fastest = max(fastest, abs(drive[i]))
         dt = min(control[2], max(control[1], control[0] / fastest))
-        noise = control[3] * math.sqrt(dt)
         for i in range(n):
-            shake = noise * uniform(seed, counter) if noise > 0 else F32(0)
-            counter += np.uint64(1)
-            voltage[i] = min(one, max(-one, voltage[i] + dt * drive[i] + shake))
+            voltage[i] += dt * drive[i]
+        if control[3] > 0:
+            width = control[3] * F32(math.sqrt(dt))
+            for i in range(n):
+                voltage[i] += width * uniform(seed, counter + np.uint64(i))
+            counter += np.uint64(n)
+        for i in range(n):
+            voltage[i] = min(one, max(-one, voltage[i]))
         elapsed += dt
     return found_at

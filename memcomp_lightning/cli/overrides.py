@@ -1,0 +1,132 @@
+"""The command line before Hydra sees it: every job is composed and checked, and nothing is written."""
+
+import hashlib
+import math
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
+from memcomp_lightning.errors import require
+
+CONFIG_MODULE = "memcomp_lightning.conf"
+
+MULTIRUN_FLAGS = {"-m", "--multirun"}
+
+LONGEST_NAME = 150
+"""Characters of a job's folder; file systems allow 255."""
+
+
+def job_folder(overrides: str) -> str:
+    """Name of a job's folder: its overrides, as one path component that every file system takes.
+
+    >>> job_folder("sampler=cd,model.weights=runs/a.pt")
+    'sampler=cd,model.weights=runs_a.pt'
+    """
+    name = overrides.replace("/", "_").replace("\\", "_")
+    if len(name) > LONGEST_NAME:
+        name = f"{name[:LONGEST_NAME]}_{hashlib.sha256(overrides.encode()).hexdigest()[:8]}"
+    return name or "job"
+
+
+OmegaConf.register_new_resolver("memcomp_job_folder", job_folder, replace=True)
+
+
+def is_multirun(arguments: Sequence[str]) -> bool:
+    """Whether the command line asks for a sweep."""
+    return bool(MULTIRUN_FLAGS & set(arguments))
+
+
+def check_command_line(
+    arguments: Sequence[str],
+    *,
+    config_name: str,
+    check: Callable[[DictConfig], object],
+    folders: tuple[str, str],
+) -> None:
+    """Check every job that the arguments stand for, and do none; with other flags, such as --help, nothing.
+
+    Args:
+        arguments: As typed, without the program's name.
+        config_name: The configuration that the overrides are for.
+        check: Builds what a job needs, or raises one of ``CONFIGURATION_ERRORS``.
+        folders: Where a run and a sweep write, unless the arguments say it.
+
+    Raises:
+        UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
+    """
+    if not {argument for argument in arguments if argument.startswith("-")} <= MULTIRUN_FLAGS:
+        return
+    multirun = is_multirun(arguments)
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
+    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+        plain = compose(config_name)
+        groups = GlobalHydra.instance().config_loader().list_groups("")
+        try:
+            jobs = _jobs(overrides) if multirun else [list(overrides)]
+            _raise_first(unknown_setting(o, plain, groups) for o in jobs[0] if "." not in o.partition("=")[0])
+            defaults = compose(config_name, [o for o in jobs[0] if _chooses_group(o)])
+            _raise_first(unknown_setting(override, defaults, groups) for override in jobs[0])
+        except CONFIGURATION_ERRORS as error:
+            raise UserError(explain(error)) from error
+        for job in jobs:
+            try:
+                check(compose(config_name, job))
+            except CONFIGURATION_ERRORS as error:
+                where = f" (job {' '.join(job)})" if multirun else ""
+                raise UserError(explain(error) + where) from error
+
+
+def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:
+    """Raise unless a file can be made where the run folder will be."""
+    given = dict(override.split("=", 1) for override in overrides if override.startswith(f"{key}="))
+    folder = Path(given.get(key, default).strip("'\"")).absolute()
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{key} = {folder} is not allowed: no file can be written in {existing} ({error.strerror}). Choose "
+            f"another folder with {key}=PATH."
+        ) from error
+
+
+def _jobs(overrides: Sequence[str]) -> list[list[str]]:
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    (jobs,) = BasicSweeper.split_arguments(parsed, None)
+    return jobs
+
+
+def _chooses_group(override: str) -> bool:
+    name, _, value = override.partition("=")
+    return "." not in name and name not in ("seed",) and bool(value)
+
+
+def _raise_first(messages: Iterable[str | None]) -> None:
+    for message in messages:
+        if message is not None:
+            raise UserError(message)
+
+
+def check_finite(node: Any, name: str = "") -> None:
+    """Refuse NaN and infinity anywhere: optimisers, samplers and solvers would take some of them."""
+    if isinstance(node, DictConfig):
+        for key in node:
+            if not OmegaConf.is_interpolation(node, str(key)):
+                check_finite(node[key], f"{name}.{key!s}".lstrip("."))
+    elif isinstance(node, float):
+        require(math.isfinite(node), name, node, "a finite number")
+
+
+def check_seed(seed: object) -> None:
+    """Refuse a seed that is no integer."""
+    require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")

@@ -1,0 +1,121 @@
+"""The path of a machine through the weight of unsatisfied clauses."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.qubo.qubo import Trajectory
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; they differ in lightness, too.
+_PATH, _BEST, _BOX = "#0072B2", "#D55E00", "0.35"
+
+_CURVES, _CURVES_ALONE = 0.54, 0.88
+"""Share of the panel's height that the curves take, with an inset above them and with the legend alone."""
+
+
+def plot_trajectory(
+    trajectory: Trajectory, *, last: int = 3, width: float = 5.2, height: float = 3.6, title: str = ""
+) -> Figure:
+    """Total weight of unsatisfied clauses against machine time (Manukian et al. 2019, Fig. 2).
+
+    The restarts follow one another on the time axis, so that each one begins with a spike. The large panel shows
+    the last few of them, the inset all, with a box around what the large panel shows.
+
+    Args:
+        trajectory: Of one problem, ``(n_restarts, n_records)``; records of no dwell (not run) are left out.
+        last: Number of restarts in the large panel, >= 1.
+        width: Inches.
+        height: Inches.
+        title: Printed above.
+
+    Returns:
+        A figure of its own, which pyplot does not know.
+
+    Raises:
+        SettingError: The trajectory is of several problems, or holds no records.
+    """
+    require_count("last", last)
+    shape = tuple(trajectory.time.shape)
+    require(
+        len(shape) == 2,
+        "trajectory's shape",
+        shape,
+        "(n_restarts, n_records), one problem",
+        "Take one: Trajectory(*(field[index] for field in trajectory)).",
+    )
+    time, weight, starts = _one_after_another(trajectory)
+    require(time.size > 0, "trajectory", f"of shape {shape}", "at least one record of dwell > 0")
+    best = np.minimum.accumulate(weight)
+    n_restarts = len(starts) - 1
+    shown = max(n_restarts - last, 0)
+    begin, end = float(starts[shown]), float(starts[-1])
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.add_subplot()
+    part = time > begin
+    _draw(axes, time[part], weight[part], best[part], linewidth=1.1)
+    low, high = _margins(float(best[-1]), float(weight[part].max()))
+    axes.set_xlim(*_margins(begin, end, share=0.015))
+    axes.set_ylim(low, low + (high - low) / (_CURVES if shown else _CURVES_ALONE))
+    # The axis ends where the curves do: the room above is for the inset and the legend.
+    axes.spines["left"].set_bounds(low, high)
+    axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= high])
+    axes.vlines(starts[shown + 1 : -1], low, high, color="0.85", linewidth=0.8, zorder=0)
+    axes.set_xlabel("machine time (dimensionless)")
+    axes.set_ylabel("weight of unsatisfied clauses", y=(_CURVES if shown else _CURVES_ALONE) / 2)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(loc="upper left", frameon=False, fontsize="small", borderaxespad=0, ncols=1 if shown else 2)
+    if title:
+        axes.set_title(title, fontsize="medium", loc="left")
+    if shown:
+        inset = axes.inset_axes((0.4, _CURVES + 0.06, 0.6, 0.92 - _CURVES))
+        _draw(inset, time, weight, best, linewidth=0.5)
+        inset.set_xlim(*_margins(0.0, end, share=0.02))
+        inset.set_ylim(*_margins(float(weight.min()), float(weight.max()), share=0.12))
+        inset.tick_params(labelsize="x-small", length=2)
+        inset.set_title(f"all {n_restarts} restarts", fontsize="x-small", pad=2)
+        box = Rectangle((begin, low), end - begin, high - low)
+        box.set(facecolor="none", edgecolor=_BOX, linewidth=0.9, zorder=5)
+        inset.add_patch(box)
+    return figure
+
+
+def _one_after_another(
+    trajectory: Trajectory,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Times and weights ``(n_records,)`` of all restarts on one axis; where each begins, and the last one ends."""
+    time, weight = trajectory.time.double().cpu().numpy(), trajectory.unsatisfied_weight.double().cpu().numpy()
+    made = trajectory.dwell.cpu().numpy() > 0
+    was_run = made.any(1)
+    time, weight, made = time[was_run], weight[was_run], made[was_run]
+    starts = np.concatenate(([0.0], np.cumsum((time * made).max(1, initial=0.0))))
+    return (time + starts[:-1, None])[made], weight[made], starts
+
+
+def _draw(
+    axes: Axes,
+    time: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    best: NDArray[np.float64],
+    *,
+    linewidth: float,
+) -> None:
+    axes.plot(
+        time,
+        best,
+        color=_BEST,
+        linewidth=1.3 * linewidth,
+        linestyle="--",
+        drawstyle="steps-post",
+        label="best so far",
+    )
+    axes.plot(time, weight, color=_PATH, linewidth=linewidth, label="machine")
+
+
+def _margins(low: float, high: float, share: float = 0.06) -> tuple[float, float]:
+    """Room on both sides, as a share of the interval."""
+    room = share * (high - low) or 0.5
+    return low - room, high + room
