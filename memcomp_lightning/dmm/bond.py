@@ -115,7 +115,7 @@ class BondField:
         # The energy is coupling / 4 a bond and linear / 2 + sum of couplings / 4 a field: here times -4.
         field = -2 * linear - qubo.graph.scatter(coupling, coupling)
         norm = coupling_norm(qubo.graph, coupling)
-        scale = norm / collective_mode(qubo.graph, coupling, norm)
+        scale = norm / collective_mode(qubo.graph, coupling / expand(norm, n_axes))
         bond = -coupling / expand(scale, n_axes)
         field = decisive(qubo.graph, bond, field / scale.unsqueeze(-1))
         return BondMachine(

@@ -126,9 +126,7 @@ class ClauseField:
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
             longer_weight=(longer_weight / scale.unsqueeze(-1)).unsqueeze(-2),
-            stability=collective_mode(
-                maxsat.graph, weight * maxsat.first * maxsat.second, torch.ones_like(scale)
-            ).unsqueeze(-1),
+            stability=collective_mode(maxsat.graph, weight * maxsat.first * maxsat.second).unsqueeze(-1),
         )
 
     def stability(self, machine: ClauseMachine) -> Tensor:

@@ -38,24 +38,29 @@ def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
     return torch.where(norm > _SMALLEST_RATIO, norm, torch.ones_like(norm))
 
 
-def collective_mode(graph: Graph, coupling: Tensor, norm: Tensor) -> Tensor:
-    r"""``min(1, 2 norm / \lambda)`` with the largest \|eigenvalue\| of the couplings, ``(*problems,)``.
+def collective_mode(graph: Graph, coupling: Tensor) -> Tensor:
+    r"""``min(1, 2 / \lambda)`` with the largest \|eigenvalue\| of couplings of norm 1, ``(*problems,)``.
 
-    Independent couplings have lambda of about twice their norm. Where all variables pull alike, as in MAX-CUT of
-    an unweighted graph, lambda is larger, and steps that suit independent couplings would let all variables flip
-    back and forth together: the critical step falls with 1 / lambda. Found by power iteration from a fixed start.
+    Independent couplings have lambda of about 2. Where all variables pull alike, as in MAX-CUT of an unweighted
+    graph, lambda is larger, and steps that suit independent couplings would let all variables flip back and forth
+    together: the critical step falls with 1 / lambda. Found by power iteration from a fixed start, which is
+    orthogonal to no pattern that problems are likely to have.
+
+    Args:
+        graph: The pairs.
+        coupling: ``(*problems, *edge_shape)``, divided by their :func:`coupling_norm`.
     """
+    problems = coupling.shape[: coupling.ndim - len(graph.edge_shape)]
     n = torch.arange(graph.n, device=coupling.device, dtype=coupling.dtype)
-    # A start that is orthogonal to no pattern that problems are likely to have.
-    x = (1 + 0.5 * torch.sin(n * n)).expand(*norm.shape, 1, graph.n)
+    x = (1 + 0.5 * torch.sin(n * n)).expand(*problems, 1, graph.n)
     for _ in range(_POWER_ITERATIONS):
-        x = torch.nn.functional.normalize(x, dim=-1)
         x = graph.field(coupling, x)
-    largest = x.norm(dim=-1).squeeze(-1)
-    return torch.where(largest > 2 * norm, 2 * norm / largest.clamp(min=_SMALLEST_RATIO), torch.ones_like(norm))
+    before = x.norm(dim=-1, keepdim=True)
+    x = graph.field(coupling, x / before.clamp(min=_SMALLEST_RATIO))
+    return (2 / x.norm(dim=-1).squeeze(-1).clamp(min=_SMALLEST_RATIO)).clamp(max=1)
 
 
-_POWER_ITERATIONS = 8
+_POWER_ITERATIONS = 5
 """A collective mode stands out of the spectrum: a few iterations find it."""
 
 

@@ -218,8 +218,8 @@ class DmmSolver:
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps a restart, by the rule ``25 sqrt(n)`` of the number of variables, at least 200."""
-    return max(200, round(25 * math.sqrt(problem.n)))
+    """Steps a restart, by the rule ``4 n^(3/4)`` of the number of variables, at least 100."""
+    return max(100, round(4 * problem.n**0.75))
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:

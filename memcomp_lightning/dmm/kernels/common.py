@@ -16,7 +16,7 @@ REFRESH: Final = 64
 MAX_SWEEPS: Final = 1000
 """Ends a quench that rounding errors would keep alternating between equal energies."""
 
-FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp"}
+FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp", "nnan", "ninf"}
 """Sums may be reordered, which vector code needs; NaN and infinity keep their meaning."""
 
 

@@ -388,7 +388,7 @@ def integrate(problem, digital, linear, c, control, start, steps, best, times, s
     x, field, true = np.empty((n, lanes), F32), np.empty((n, lanes), F32), np.zeros((n_longer, lanes), np.int32)
     tried, tried_field, tried_true = np.empty_like(x), np.empty_like(field), np.empty_like(true)
     energy, reached = np.zeros(lanes), np.zeros(lanes)
-    lowest, found_at = np.full(lanes, np.inf), np.zeros(lanes, np.int64)
+    lowest, found_at = np.full(lanes, 1e300), np.zeros(lanes, np.int64)
     elapsed, dt, fastest = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
     for i in range(n):
         for k in range(lanes):

@@ -168,15 +168,17 @@ def local_fields(coupling, linear, x, field):
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
 def quench(coupling, transposed, x, field):
     """Flip single variables as long as each flip lowers the energy; return the change."""
-    total = 0.0
+    total, one, two = 0.0, F32(1), F32(2)
     for _ in range(MAX_SWEEPS):
-        moving = False
+        # A vector loop finds out whether anything moves; the sweep itself goes one by one.
+        eager = 0
         for i in range(x.size):
-            if (field[i] < 0) if x[i] < F32(0.5) else (field[i] > 0):
-                total += flip(coupling, transposed, x, field, i)
-                moving = True
-        if not moving:
+            eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
+        if eager == 0:
             break
+        for i in range(x.size):
+            if (one - two * x[i]) * field[i] < 0:
+                total += flip(coupling, transposed, x, field, i)
     return total
 
 
@@ -254,7 +256,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
     for i in range(n):
         x[i] = one if voltage[i] > 0 else F32(0)
     energy = local_fields(coupling, linear, x, field)
-    lowest, found_at, elapsed = np.inf, 0, 0.0
+    lowest, found_at, elapsed = 1e300, 0, 0.0
     dt, changed, n_reads, counter = F32(0), True, 0, np.uint64(0)
     for step in range(n_steps + 1):
         recorded = every > 0 and step > 0 and step % every == 0
