@@ -9,29 +9,41 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from running import Outcome, launch
 
-from memcomp_lightning.cli import sweep, train
+from memcomp_lightning.cli import solve, sweep, train
+
+RunCommand = Callable[[str, Callable[[], None], tuple[str, ...]], Outcome]
 
 
 @pytest.fixture
-def memcomp_train(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., Outcome]:
-    """Run ``memcomp-train`` in this process, in a folder of its own."""
+def run_command(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path) -> RunCommand:
+    """Run a command in this process, in a folder of its own."""
     monkeypatch.chdir(tmp_path)
 
-    def run(*arguments: str) -> Outcome:
-        monkeypatch.setattr(sys, "argv", ["memcomp-train", *arguments])
+    def run(name: str, main: Callable[[], None], arguments: tuple[str, ...]) -> Outcome:
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
         monkeypatch.setattr(sweep.RememberSweepFolder, "folder", None)
         GlobalHydra.instance().clear()
         status = 0
         try:
-            train.main()
+            main()
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else 1
         captured = capfd.readouterr()
         return Outcome(status, captured.out, captured.err)
 
     return run
+
+
+@pytest.fixture
+def memcomp_train(run_command: RunCommand) -> Callable[..., Outcome]:
+    """Run ``memcomp-train`` in this process, in a folder of its own."""
+    return lambda *arguments: run_command("memcomp-train", train.main, arguments)
+
+
+@pytest.fixture
+def memcomp_solve(run_command: RunCommand) -> Callable[..., Outcome]:
+    """Run ``memcomp-solve`` in this process, in a folder of its own."""
+    return lambda *arguments: run_command("memcomp-solve", solve.main, arguments)
 
 
 @pytest.fixture

@@ -1,0 +1,215 @@
+"""``memcomp-solve``: files in, a table, a solution and a picture out; one line where something is wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from running import Outcome
+
+import memcomp_lightning
+from memcomp_lightning.qubo import read_problem
+
+Solve = Callable[..., Outcome]
+CONF = Path(memcomp_lightning.__file__).parent / "conf"
+FAST = ["solver.max_steps=40", "solver.n_restarts=4", "hydra.run.dir=run"]
+
+
+@pytest.fixture(autouse=True)
+def files(tmp_path: Path) -> None:
+    """One small problem of each format, and a few that are not."""
+    ring = "\n".join(f"{i} {i % 5 + 1} 1" for i in range(1, 6))
+    (tmp_path / "ring.txt").write_text(f"5 5\n{ring}\n")
+    (tmp_path / "b.sparse").write_text("3 3\n1 1 -3\n1 3 2\n2 3 -5\n")
+    (tmp_path / "spins.coo").write_text("# vartype=SPIN\n0 0 0.5\n0 1 -1.25\n1 2 2.0\n")
+    (tmp_path / "pairs.wcnf").write_text("p wcnf 3 4 10\n10 1 2 0\n2 -1 0\n3 -2 0\n1 3 0\n")
+    (tmp_path / "triples.cnf").write_text("p cnf 3 2\n1 2 3 0\n-1 -2 -3 0\n")
+    np.savez(tmp_path / "rbm.npz", weight=np.ones((2, 3)), b=-np.ones(3), c=np.ones(2))
+    (tmp_path / "bad.txt").write_text("3 2\n1 2 1\n1 4 1\n")
+
+
+def left_behind() -> set[str]:
+    return {path.name for path in Path.cwd().iterdir() if path.is_dir()}
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "objective", "energy"),
+    [
+        ("ring.txt", [], 4, -4),
+        ("b.sparse", [], -10, -10),
+        ("b.sparse", ["maximise=true"], 1, -1),
+        ("spins.coo", [], -3.75, -3.75),
+        ("pairs.wcnf", [], 2, 2),
+        ("rbm.npz", [], -5, -5),
+        ("ring.txt", ["format=gset", "solver=dmm"], 4, -4),
+        ("b.sparse", ["solver=brute_force"], -10, -10),
+        ("b.sparse", ["solver=alternating_descent"], -10, -10),
+    ],
+)
+def test_solution_is_that_of_the_file(
+    memcomp_solve: Solve, file: str, options: list[str], objective: float, energy: float
+) -> None:
+    own = any(option in ("solver=brute_force", "solver=alternating_descent") for option in options)
+    outcome = memcomp_solve(f"problem={file}", *options, *(FAST[2:] if own else FAST), "seed=3")
+    assert outcome.status == 0, outcome.err
+    found = json.loads(Path("run/solution.json").read_text())
+    problem = read_problem(file, maximise="maximise=true" in options)
+    x = torch.tensor(found["assignment"], dtype=torch.float64)
+    assert problem.problem.energy(x[None]).item() == pytest.approx(found["energy"]) == energy
+    assert problem.score(x).value == pytest.approx(found["objective"]["value"]) == objective
+    assert found["energy"] == min(found["restarts"]["energy"])
+    assert found["seed"] == 3
+    assert found["problem"]["file"] == file
+    assert "".join(map(str, found["assignment"])) in outcome.out
+    assert f"{objective:g}  ({found['objective']['direction']})" in outcome.out
+    assert "run/solution.json" in outcome.out
+    recorded = not any(option.startswith("solver=") for option in options)
+    assert ("run/trajectory.png" in outcome.out) == recorded
+    for picture in ("trajectory.png", "trajectory.svg"):
+        assert Path("run", picture).exists() == recorded
+
+
+def test_clauses_of_three_literals(memcomp_solve: Solve) -> None:
+    outcome = memcomp_solve("problem=triples.cnf", *FAST)
+    assert outcome.status == 0, outcome.err
+    assert json.loads(Path("run/solution.json").read_text())["objective"]["value"] == 0
+
+
+def test_table_says_what_a_person_wants_to_know(memcomp_solve: Solve) -> None:
+    outcome = memcomp_solve("problem=pairs.wcnf", *FAST)
+    for part in (
+        "pairs: 3 variables, 4 clauses (1 hard); format wcnf, pairs.wcnf",
+        "weight of unsatisfied soft clauses  2  (minimise)",
+        "hard clauses                        0 unsatisfied",
+        "of 4 restarts)",
+        "4 x STEP_BUDGET",
+        "more restarts may find a lower one",
+        "wall time",
+        "assignment                          101",
+    ):
+        assert part in outcome.out
+
+
+def test_long_assignments_stay_in_the_file(memcomp_solve: Solve) -> None:
+    Path("long.txt").write_text("101 1\n1 101 1\n")
+    outcome = memcomp_solve("problem=long.txt", *FAST)
+    assert "010" not in outcome.out
+    assert "run/solution.json  (the assignment, among the rest)" in outcome.out
+    assert len(json.loads(Path("run/solution.json").read_text())["assignment"]) == 101
+
+
+def test_same_seed_same_answer(memcomp_solve: Solve) -> None:
+    answers = []
+    for seed in (0, 0, 1):
+        assert memcomp_solve("problem=ring.txt", "solver=alternating_descent", f"seed={seed}", FAST[2]).status == 0
+        answers.append(json.loads(Path("run/solution.json").read_text())["restarts"])
+    assert answers[0] == answers[1] != answers[2]
+
+
+@pytest.mark.parametrize("name", ["a (1), b=c.txt", "it's.txt", "17", "[x].txt"])
+def test_files_are_called_as_they_like(memcomp_solve: Solve, name: str) -> None:
+    Path("ring.txt").rename(name)
+    outcome = memcomp_solve(f"problem={name}", *FAST)
+    assert outcome.status == 0, outcome.err
+    assert json.loads(Path("run/solution.json").read_text())["problem"]["file"] == name
+
+
+def test_default_folder_is_named_by_date_and_time(memcomp_solve: Solve) -> None:
+    assert memcomp_solve("problem=ring.txt", *FAST[:2]).status == 0
+    (folder,) = Path("solve").iterdir()
+    assert time.strptime(folder.name, "%Y-%m-%d_%H-%M-%S")
+    assert {path.name for path in folder.iterdir()} >= {"solution.json", "trajectory.png", "trajectory.svg"}
+
+
+def test_every_combination_in_a_multirun(memcomp_solve: Solve) -> None:
+    outcome = memcomp_solve("-m", "problem=ring.txt,b.sparse", "seed=0,1", *FAST[:2], "hydra.sweep.dir=all")
+    assert outcome.status == 0, outcome.err
+    assert len(list(Path("all").glob("*/solution.json"))) == 4
+
+
+REFUSED = {
+    "": ["problem=FILE is missing", "memcomp-solve problem=G1.txt", "beasley", "--help"],
+    "problem=": ["problem=FILE is missing"],
+    "problem=bad.txt": ["bad.txt, line 3: found '1 4 1', expected two vertices, integers from 1 to 3."],
+    "problem=rign.txt": ["rign.txt: there is no such file. Near it: ring.txt"],
+    "problem=a=b,c.txt": ["a=b,c.txt: there is no such file."],
+    "problem=.": ["cannot be read"],
+    "ring.txt": ["ring.txt is no setting", "Did you mean problem=ring.txt?"],
+    "problm=ring.txt": ["problm=ring.txt", "does not exist", "Did you mean problem?"],
+    "problem=ring.txt solver.n_restart=3": ["solver.n_restart=3", "Did you mean solver.n_restarts?"],
+    "problem=ring.txt solver=dmn": ["solver/dmn", "brute_force dmm"],
+    "problem=ring.txt solver.max_steps=0": ["max_steps = 0", "an integer >= 1"],
+    "problem=ring.txt solver.field.alpha=nan": ["solver.field.alpha = nan", "a finite number"],
+    "problem=ring.txt format=gest": ["format = 'gest'", "'gset'"],
+    "problem=ring.txt format=beasley": ["line 6: found '5 1 1', expected i <= j"],
+    "problem=ring.txt maximise=1": ["maximise = 1", "true or false"],
+    "problem=pairs.wcnf maximise=true": ["maximise = True", "false for a file of format 'wcnf'"],
+    "problem=ring.txt seed=1.5": ["seed = 1.5", "an integer"],
+    "problem=ring.txt +keep=1": ["setting = 'keep'", "'problem'"],
+    "problem=ring.txt model=dbn": ["'model'"],
+    "problem=ring.txt hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
+    "problem=triples.cnf solver=brute_force": ["longest clause = 3", "at most 2 literals"],
+    "problem=ring.txt solver.max_steps=1000000000": ["solver.record.every = 8", "at least 33", "solver=dmm"],
+    "-m problem=ring.txt,bad.txt": ["bad.txt, line 3", "(job problem=bad.txt)"],
+}
+
+
+@pytest.mark.parametrize("arguments", REFUSED)
+def test_refused_in_one_line(memcomp_solve: Solve, arguments: str) -> None:
+    outcome = memcomp_solve(*arguments.split())
+    assert outcome.status == 2
+    assert outcome.out == ""
+    assert outcome.err.startswith("memcomp-solve: ")
+    assert outcome.err.count("\n") == 1
+    for part in REFUSED[arguments]:
+        assert part in outcome.err
+    assert left_behind() == set(), "a refused command leaves nothing behind"
+
+
+def test_a_problem_too_large_for_the_solver_ends_in_one_line(memcomp_solve: Solve) -> None:
+    outcome = memcomp_solve("problem=ring.txt", "solver=brute_force", "solver.max_variables=3", FAST[2])
+    assert outcome.status == 2
+    assert outcome.err.startswith("memcomp-solve: number of variables to enumerate = 5")
+
+
+def test_help_has_examples_every_format_and_every_solver(memcomp_solve: Solve) -> None:
+    outcome = memcomp_solve("--help")
+    assert outcome.status == 0
+    for part in ("memcomp-solve problem=G1.txt", "maximise: false", "beasley  .sparse", "p wcnf n m top"):
+        assert part in outcome.out
+    for solver in sorted(path.stem for path in (CONF / "solver").glob("*.yaml")):
+        assert solver in outcome.out
+    assert left_behind() == set()
+
+
+def test_as_a_process_with_ctrl_c(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "memcomp_lightning.cli.solve",
+            "problem=ring.txt",
+            "solver=dmm",
+            "solver.max_steps=10000000",
+        ],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("ring: 5 variables, 5 couplings")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "memcomp-solve: interrupted" in err
+    assert "Traceback" not in err
+    assert not list(tmp_path.rglob("solution.json"))

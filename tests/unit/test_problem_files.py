@@ -1,0 +1,519 @@
+"""Problem files: energies against the formats' own definitions, faults with their place."""
+
+import gzip
+import itertools
+import json
+import math
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from memcomp_lightning import __version__, rng
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models import RBM
+from memcomp_lightning.qubo import (
+    FORMATS,
+    BruteForce,
+    ProblemFileError,
+    Qubo,
+    QuboSolution,
+    Status,
+    WeightedMaxSat,
+    read_problem,
+    write_solution,
+)
+
+DATA = Path(os.environ.get("MEMCOMP_DATA_DIR", "")) / "qubo"
+needs_qubo_files = pytest.mark.skipif(
+    not (os.environ.get("MEMCOMP_DATA_DIR") and DATA.is_dir()), reason="MEMCOMP_DATA_DIR has no folder qubo"
+)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a file, text or bytes."""
+
+    def write_file(name, content):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write_file
+
+
+def states(n):
+    return torch.tensor(list(itertools.product((0, 1), repeat=n)), dtype=torch.float64)
+
+
+def check(problem, energy, objective):
+    """Compare with plain Python functions of one state, a list of 0 and 1, on all states."""
+    for x, found in zip(states(problem.problem.n), problem.problem.energy(states(problem.problem.n)), strict=True):
+        assert float(found) == pytest.approx(energy(x.tolist()), abs=1e-12)
+        assert problem.score(x).value == pytest.approx(objective(x.tolist()), abs=1e-12)
+
+
+# ------------------------------------------------------------------------------------------------ MAX-CUT
+
+EDGES = [(1, 2, 3), (2, 3, -1), (1, 4, 2.5), (3, 4, 1), (1, 2, 1)]
+
+
+def cut(x, edges=EDGES):
+    return sum(w for i, j, w in edges if x[i - 1] != x[j - 1])
+
+
+@pytest.mark.parametrize("header", ["4 5", "4 5 J", "  4\t5   planar, seed 3 "])
+@pytest.mark.parametrize("name", ["G.txt", "G", "G.mc", "bench-1.0"])
+def test_gset(write, name, header):
+    lines = [header, *(f"{i} {j} {w}" for i, j, w in EDGES)]
+    problem = read_problem(write(name, "\n".join(lines)))
+    check(problem, lambda x: -cut(x), cut)
+    assert problem.format == "gset"
+    assert (problem.objective.name, problem.objective.direction) == ("cut weight", "maximise")
+    assert problem.sizes == {"variables": 4, "couplings": 4}, "entries of a pair add up"
+
+
+def test_gset_without_weights_windows_lines_and_blank_lines(write):
+    problem = read_problem(write("G.txt", "\r\n3 2\r\n\r\n1 2\r\n3 1\r\n\r\n"))
+    check(problem, lambda x: -cut(x, [(1, 2, 1), (3, 1, 1)]), lambda x: cut(x, [(1, 2, 1), (3, 1, 1)]))
+
+
+def test_gset_without_edges(write):
+    problem = read_problem(write("G.txt", "3 0\n"))
+    assert problem.sizes == {"variables": 3, "couplings": 0}
+    assert str(problem.score(torch.zeros(3)).value) == "0.0", "not -0.0"
+
+
+def test_gset_is_maximised_with_or_without_the_option(write):
+    path = write("G.txt", "2 1\n1 2 7\n")
+    for maximise in (True, False):
+        assert read_problem(path, maximise=maximise).problem.energy(torch.tensor([[0.0, 1.0]])).item() == -7
+
+
+# ------------------------------------------------------------------------------------------------ x'Qx
+
+ENTRIES = {(1, 1): -3.0, (1, 3): 2.0, (2, 3): -5.0, (3, 3): 4.0}
+
+
+def quadratic(x):
+    """x'Qx with the full symmetric matrix."""
+    matrix = np.zeros((3, 3))
+    for (i, j), q in ENTRIES.items():
+        matrix[i - 1, j - 1] = matrix[j - 1, i - 1] = q
+    return float(np.array(x) @ matrix @ np.array(x))
+
+
+@pytest.mark.parametrize("maximise", [False, True])
+def test_beasley(write, maximise):
+    lines = ["3 4", *(f" {i} {j} {q:g} " for (i, j), q in ENTRIES.items())]
+    problem = read_problem(write("b.sparse", "\n".join(lines)), maximise=maximise)
+    sign = -1 if maximise else 1
+    check(problem, lambda x: sign * quadratic(x), quadratic)
+    assert problem.objective.direction == ("maximise" if maximise else "minimise")
+
+
+# ------------------------------------------------------------------------------------------------ dimod's list
+
+BIASES = [(0, 0, 0.5), (0, 2, -1.25), (2, 1, 3.0), (1, 1, 1e-3), (0, 2, 0.5)]
+COO = "\n".join(f"{i} {j} {bias}" for i, j, bias in BIASES)
+
+
+def biased(x):
+    return sum(bias * (x[i] if i == j else x[i] * x[j]) for i, j, bias in BIASES)
+
+
+@pytest.mark.parametrize("maximise", [False, True])
+@pytest.mark.parametrize(
+    "vartype", ["", "# vartype=BINARY\n", "# vartype=SPIN\n", "#  my model, vartype: SPIN\n\n# z\n"]
+)
+@pytest.mark.parametrize("name", ["m.coo", "m.txt", "m"])
+def test_coo(write, name, vartype, maximise):
+    problem = read_problem(write(name, f"{vartype}{COO} # the last\n"), maximise=maximise)
+    spin = "SPIN" in vartype
+
+    def objective(x):
+        return biased([2 * bit - 1 for bit in x] if spin else x)
+
+    check(problem, lambda x: -objective(x) if maximise else objective(x), objective)
+    assert problem.objective.name == ("SPIN energy" if spin else "BINARY energy")
+
+
+# ------------------------------------------------------------------------------------------------ clauses
+
+CLAUSES = [[1, 2], [-1], [-1, -2, 3], [3, -2], [2, -3, 3], [1, 1]]
+
+
+def unsatisfied(x, weights):
+    false = [not any((x[abs(q) - 1] == 1) == (q > 0) for q in clause) for clause in CLAUSES]
+    return sum(weight for weight, is_false in zip(weights, false, strict=True) if is_false), false
+
+
+def listed(clauses, prefixes):
+    return "\n".join(f"{p} {' '.join(map(str, c))} 0" for p, c in zip(prefixes, clauses, strict=True))
+
+
+def test_cnf(write):
+    text = f"c a comment\np cnf 3 6\n{listed(CLAUSES, [''] * 6)}\n"
+    problem = read_problem(write("a.cnf", text))
+    assert isinstance(problem.problem, WeightedMaxSat)
+    check(problem, *[lambda x: unsatisfied(x, [1] * 6)[0]] * 2)
+    assert problem.sizes == {"variables": 3, "clauses": 6}
+    assert problem.objective.name == "unsatisfied clauses"
+
+
+def test_cnf_with_clauses_across_lines_and_the_end_mark_of_satlib(write):
+    text = "p cnf 3 6\n1 2 0 -1 0 -1\n-2 3 0\n3 -2 0 2 -3 3 0\n1 1\n0\n%\n0\n\n"
+    check(read_problem(write("a.cnf", text)), *[lambda x: unsatisfied(x, [1] * 6)[0]] * 2)
+
+
+WCNF = {
+    "old": f"p wcnf 3 6 30\n{listed(CLAUSES, [30, 2, 31, 0.5, 4, 3])}",
+    "new": f"c {{json}}\n{listed(CLAUSES, ['h', 2, 'h', 0.5, 4, 3])}",
+}
+
+
+@pytest.mark.parametrize("era", WCNF)
+@pytest.mark.parametrize("name", ["a.wcnf", "a.txt"])
+def test_wcnf(write, name, era):
+    problem = read_problem(write(name, WCNF[era]))
+    soft, hard = [0, 2, 0, 0.5, 4, 3], [True, False, True, False, False, False]
+    above = 1 + sum(soft)
+
+    def energy(x):
+        weight, false = unsatisfied(x, soft)
+        return weight + above * sum(f and h for f, h in zip(false, hard, strict=True))
+
+    check(problem, energy, lambda x: unsatisfied(x, soft)[0])
+    for x in states(3):
+        broken = sum(f and h for f, h in zip(unsatisfied(x.tolist(), soft)[1], hard, strict=True))
+        assert problem.score(x).hard_unsatisfied == broken
+    assert problem.sizes == {"variables": 3, "clauses": 6, "hard_clauses": 2}
+
+
+def test_breaking_a_hard_clause_never_pays(write):
+    problem = read_problem(write("a.wcnf", "h 1 0\n5 -1 0\n7 -1 2 0\n1000 -2 0\n"))
+    energy = problem.problem.energy(states(2))
+    assert energy[2:].max() < energy[:2].min()
+
+
+def test_wcnf_without_top_has_no_hard_clauses(write):
+    problem = read_problem(write("a.wcnf", "p wcnf 2 2\n9 1 0\n1 -1 2 0\n"))
+    assert problem.sizes == {"variables": 2, "clauses": 2}
+
+
+def test_empty_clauses_are_never_satisfied(write):
+    problem = read_problem(write("a.wcnf", "3 0\n2 1 0\n"))
+    check(problem, lambda x: 3 + 2 * (1 - x[0]), lambda x: 3 + 2 * (1 - x[0]))
+
+
+# ------------------------------------------------------------------------------------------------ RBM
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int64])
+def test_rbm(tmp_path, dtype):
+    weight = np.array([[1, -2, 3], [-4, 5, 6]]).astype(dtype)
+    b, c = np.array([1, -1, 2]).astype(dtype), np.array([-3, 1]).astype(dtype)
+    np.savez(tmp_path / "rbm.npz", weight=weight, b=b, c=c, comment=np.array("any"))
+    problem = read_problem(tmp_path / "rbm.npz")
+
+    def energy(x):
+        v, h = np.array(x[:3]), np.array(x[3:])
+        return float(-h @ weight @ v - b @ v - c @ h)
+
+    check(problem, energy, energy)
+    assert problem.sizes == {"variables": 5, "couplings": 6}
+
+
+def test_rbm_of_the_package(tmp_path):
+    rbm = RBM(4, 3)
+    np.savez_compressed(tmp_path / "rbm.npz", **{name: t.numpy() for name, t in rbm.state_dict().items()})
+    problem = read_problem(tmp_path / "rbm.npz").problem
+    x = (rng.uniform((9, 7), generator=rng.stream(0, "states"), like=torch.zeros(())) < 0.5).float()
+    torch.testing.assert_close(problem.energy(x).float(), rbm.energy(x[:, :4], x[:, 4:]).detach())
+
+
+# ------------------------------------------------------------------------------------------------ every format
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("G1.txt", "2 1\n1 2 1\n"), ("a.b.sparse", "2 1\n1 2 1\n"), ("a.coo", "0 1 1\n"), ("a.wcnf", "h 1 2 0\n")],
+)
+def test_packed_files_have_the_name_and_energies_of_the_others(write, name, text):
+    plain = read_problem(write(name, text))
+    packed = read_problem(write(f"{name}.gz", gzip.compress(text.encode())))
+    assert packed.name == plain.name == name.rpartition(".")[0]
+    assert packed.format == plain.format
+    assert packed.problem.energy(states(2)).equal(plain.problem.energy(states(2)))
+
+
+def test_format_is_told_by_the_option_first(write):
+    path = write("b.dat", "2 1\n1 2 3\n")
+    assert read_problem(path, "gset").problem.energy(torch.tensor([[1.0, 1.0]])).item() == 0
+    assert read_problem(str(path), format="beasley").problem.energy(torch.tensor([[1.0, 1.0]])).item() == 6
+
+
+def test_a_byte_order_mark_and_odd_letters_in_comments_do_no_harm(write):
+    text = "\ufeffc Ångström …\np cnf 1 1\n1 0\n"
+    assert read_problem(write("a.cnf", text)).sizes == {"variables": 1, "clauses": 1}
+
+
+def test_a_million_couplings_take_seconds(write):
+    lines = "".join(f"{i} {j} -1\n" for i in range(1, 2001) for j in range(2001, 2501))
+    path = write("big.txt", f"2500 1000000\n{lines}")
+    begin = time.perf_counter()
+    problem = read_problem(path)
+    assert time.perf_counter() - begin < 15, "a few seconds, with room for a busy machine"
+    assert problem.sizes["couplings"] == 1_000_000
+
+
+# ------------------------------------------------------------------------------------------------ faults
+
+
+FAULTS = {
+    # name, content, line (None: of the whole file), what was found, what was expected
+    "empty": ("G.txt", "", None, "an empty file", "a problem"),
+    "blank": ("G.txt", "\n \n", None, "an empty file", "a problem"),
+    "binary": ("G.txt", b"\x00\x01\x02" * 99, None, "binary data", "a text file"),
+    "garbage": ("G.txt", b"\xff\xfe\x80\x81\n" * 9, None, "first lines of no known format", "format=NAME"),
+    "suffix": ("G.json", "{}", None, "the suffix .json", "gset (.gset, .mc, .rud: G-set"),
+    "gset header": ("G.mc", "three 2\n1 2 1\n", 1, "'three 2'", "the numbers of vertices and edges"),
+    "gset one number": ("G.mc", "3\n1 2 1\n", 1, "'3'", "the numbers of vertices and edges"),
+    "gset no variables": ("G.txt", "0 1\n1 2 1\n", 1, "'0 1'", "a number of variables from 1 to"),
+    "gset far too many": ("G.txt", f"{10**12} 1\n1 2 1\n", 1, f"'{10**12} 1'", "from 1 to 10000000"),
+    "gset above": ("G.txt", "3 2\n\n1 2 1\n1 4 1\n", 4, "'1 4 1'", "two vertices, integers from 1 to 3"),
+    "gset below": ("G.txt", "3 2\n0 2 1\n1 2 1\n", 2, "'0 2 1'", "integers from 1 to 3"),
+    "gset fraction": ("G.txt", "3 1\n1 2.5 1\n", 2, "'1 2.5 1'", "integers from 1 to 3"),
+    "gset loop": ("G.txt", "3 1\n2 2 1\n", 2, "'2 2 1'", "two different vertices"),
+    "gset too few": ("G.txt", "3 3\n1 2 1\n1 3 1\n", None, "2 edges", "3, the second number of line 1"),
+    "gset too many": ("G.txt", "3 1\n1 2 1\n1 3 1\n", None, "2 edges", "1, the second number of line 1"),
+    "gset word": ("G.txt", "3 2\n1 2 1\n1 x 1\n", 3, "'1 x 1'", "3 numbers"),
+    "gset ragged": ("G.txt", "3 2\n1 2 1\n1 3\n", 3, "'1 3'", "3 numbers"),
+    "gset ragged the other way": ("G.txt", "3 2\n1 2\n1 3 1\n", 3, "'1 3 1'", "2 numbers"),
+    "gset one column": ("G.txt", "3 2\n1\n2\n", 2, "'1'", "3 numbers"),
+    "gset four columns": ("G.txt", "3 1\n1 2 1 1\n", 2, "'1 2 1 1'", "3 numbers"),
+    "gset nan": ("G.txt", "3 2\n1 2 1\n1 3 nan\n", 3, "'1 3 nan'", "finite numbers"),
+    "gset infinity": ("G.txt", "3 2\n1 2 -inf\n1 3 1\n", 2, "'1 2 -inf'", "finite numbers"),
+    "gset overflow": ("G.txt", "3 1\n1 2 1e999\n", 2, "'1 2 1e999'", "finite numbers"),
+    "gset hexadecimal": ("G.txt", "3 1\n1 2 0x1\n", 2, "'1 2 0x1'", "3 numbers"),
+    "long line": ("G.txt", f"3 1\n{'1 2 1 ' * 50}\n", 2, f"'{'1 2 1 ' * 9}1 2...'", "3 numbers"),
+    "beasley lower": ("b.sparse", "3 1\n2 1 5\n", 2, "'2 1 5'", "i <= j"),
+    "beasley no value": ("b.sparse", "3 1\n1 2\n", 2, "'1 2'", "3 numbers"),
+    "beasley count": ("b.sparse", "3 2\n1 2 1\n", None, "1 entries", "2, the second number of line 1"),
+    "beasley above": ("b.sparse", "3 1\n1 4 5\n", 2, "'1 4 5'", "two variables, integers from 1 to 3"),
+    "coo negative": ("a.coo", "0 0 1\n-1 0 1\n", 2, "'-1 0 1'", "two variables, integers from 0"),
+    "coo vartype": ("a.coo", "# vartype=INTEGER\n0 0 1\n", 1, "vartype INTEGER", "BINARY or SPIN"),
+    "coo nothing": ("a.coo", "# vartype=SPIN\n", None, "no entries", "'i j bias'"),
+    "coo word": ("a.coo", "# vartype=SPIN\n0 0 1\n0 1 one # it\n", 3, "'0 1 one # it'", "3 numbers"),
+    "cnf header": ("a.cnf", "1 2 0\n", 1, "'1 2 0'", "'p cnf n m'"),
+    "cnf weights": ("a.cnf", "c\np wcnf 2 1 3\n1 2 0\n", 2, "'p wcnf 2 1 3'", "format=wcnf"),
+    "cnf short header": ("a.cnf", "p cnf 2\n1 2 0\n", 1, "'p cnf 2'", "'p cnf n m'"),
+    "cnf header words": ("a.cnf", "p cnf two 1\n1 2 0\n", 1, "'two 1'", "a number of variables"),
+    "cnf comments": ("a.cnf", "c nothing\nc at all\n", None, "nothing but comments", "clauses"),
+    "cnf literal": ("a.cnf", "p cnf 2 2\n1 2 0\n1 -3 0\n", 3, "literal -3", "variables from 1 to 2"),
+    "cnf word": ("a.cnf", "p cnf 2 1\n1 b 0\n", 2, "'1 b 0'", "literals, integers"),
+    "cnf fraction": ("a.cnf", "p cnf 2 1\n1 2.0 0\n", 2, "'1 2.0 0'", "literals, integers"),
+    "cnf open": ("a.cnf", "p cnf 2 2\n1 2 0\n1\n-2\n", 3, "a clause without its closing 0", "a 0 after"),
+    "cnf open inside": (
+        "a.cnf",
+        "p cnf 2 2\n1 2\n-1 0\n",
+        None,
+        "1 clauses",
+        "m = 2 of line 1 (line 2 does not end",
+    ),
+    "cnf count": ("a.cnf", "p cnf 2 3\n1 2 0\n-1 0\n", None, "2 clauses", "m = 3 of line 1"),
+    "wcnf open": (
+        "a.wcnf",
+        "p wcnf 2 2 9\n9 1 2\n1 -1 0\n",
+        2,
+        "a clause without its closing 0",
+        "a 0 at the end",
+    ),
+    "wcnf two": ("a.wcnf", "h 1 0 3 2 0\n", 1, "a 0 inside a clause", "one clause a line"),
+    "wcnf weight": ("a.wcnf", "h 1 0\n-3 1 2 0\n", 2, "'-3'", "a weight >= 0, or h for a hard clause"),
+    "wcnf nan": ("a.wcnf", "nan 1 0\n", 1, "'nan'", "a weight >= 0"),
+    "wcnf infinite": ("a.wcnf", "1e999 1 0\n", 1, "'1e999'", "a weight >= 0"),
+    "wcnf h with top": ("a.wcnf", "p wcnf 2 1 9\nh 1 0\n", 2, "'h'", "a weight >= 0."),
+    "wcnf literal": ("a.wcnf", "p wcnf 2 1 9\n1 3 0\n", 2, "literal 3", "variables from 1 to 2"),
+    "wcnf count": ("a.wcnf", "p wcnf 2 3 9\n1 2 0\n", None, "1 clauses", "m = 3 of line 1"),
+    "wcnf header": ("a.wcnf", "p cnf 2 1\n1 2 0\n", 1, "'p cnf 2 1'", "format=cnf"),
+    "wcnf top": ("a.wcnf", "p wcnf 2 1 top\n1 2 0\n", 1, "'top'", "a number for top"),
+    "wcnf lone weight": ("a.wcnf", "h 1 0\n5\n", 2, "a clause without its closing 0", "a 0 at the end"),
+    "wcnf no variables": ("a.wcnf", "3 0\n", None, "no variables", "clauses with literals"),
+    "wcnf late header": ("a.wcnf", "h 1 0\np wcnf 2 1 9\n", 2, "'p'", "a weight >= 0"),
+    "npz of text": ("a.npz", "3 2\n", None, "no readable arrays", "an .npz archive"),
+    "npz cut": ("a.npz", b"PK\x03\x04" + bytes(30), None, "no readable arrays", "an .npz archive"),
+    "gzip cut": ("G.txt.gz", gzip.compress(b"3 1\n1 2 1\n")[:-9], None, "", "a complete gzip stream"),
+    "gzip by name only": ("G.txt.gz", "3 1\n1 2 1\n", None, "Not a gzipped file", "a complete gzip stream"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_fault_is_named_in_one_line(write, case):
+    name, content, line, found, expected = FAULTS[case]
+    path = write(name, content)
+    with pytest.raises(ProblemFileError) as error:
+        read_problem(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: found {found}" if line is None else f"{path}, line {line}: found {found}")
+    assert f"expected {expected}" in message or (expected in message and ", expected " in message)
+    assert message.endswith(".")
+    assert "\n" not in message
+
+
+RBM_FAULTS = {
+    "missing": (
+        {"w": (2, 3), "b": (3,), "c": (2,)},
+        "found 'w', 'b', 'c', expected the arrays 'weight', 'b' and 'c'",
+    ),
+    "b": (
+        {"weight": (2, 3), "b": (2,), "c": (2,)},
+        r"found b of shape \(2,\), expected \(3,\), as weight is \(2, 3\)",
+    ),
+    "c": (
+        {"weight": (2, 3), "b": (3,), "c": (3,)},
+        r"found c of shape \(3,\), expected \(2,\), as weight is \(2, 3\)",
+    ),
+    "swapped": ({"weight": (3, 2), "b": (3,), "c": (2,)}, r"found b of shape \(3,\), expected \(2,\)"),
+    "axes": (
+        {"weight": (3,), "b": (3,), "c": (2,)},
+        r"found weight of shape \(3,\), expected \(n_hidden, n_visible\)",
+    ),
+    "nothing": ({"weight": (0, 2), "b": (2,), "c": (0,)}, "both >= 1"),
+}
+
+
+@pytest.mark.parametrize("case", RBM_FAULTS)
+def test_arrays_of_other_names_or_shapes(tmp_path, case):
+    shapes, message = RBM_FAULTS[case]
+    np.savez(tmp_path / "rbm.npz", **{name: np.ones(shape) for name, shape in shapes.items()})
+    with pytest.raises(ProblemFileError, match=message):
+        read_problem(tmp_path / "rbm.npz")
+
+
+@pytest.mark.parametrize(
+    "b", [np.array([1.0, np.nan]), np.array([1, 2j]), np.array(["a", "b"]), np.array([1, None], dtype=object)]
+)
+def test_arrays_of_other_than_finite_numbers(tmp_path, b):
+    np.savez(tmp_path / "rbm.npz", weight=np.ones((1, 2)), b=b, c=np.ones(1))
+    with pytest.raises(ProblemFileError, match=r"finite numbers|allow_pickle"):
+        read_problem(tmp_path / "rbm.npz")
+
+
+def test_an_array_alone_is_no_archive(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones(2))
+    with pytest.raises(ProblemFileError, match=r"expected an \.npz archive"):
+        read_problem(tmp_path / "a.npy", "rbm")
+
+
+def test_missing_file_and_what_is_near(write, tmp_path):
+    for name in ("G1.txt", "G14.txt", "notes.md"):
+        write(name, "2 0\n")
+    with pytest.raises(ProblemFileError, match=r"G11\.txt: there is no such file\. Near it: G1\.txt, G14\.txt\.$"):
+        read_problem(tmp_path / "G11.txt")
+    with pytest.raises(ProblemFileError, match=r"no such file\. Nothing in the folder .* is called nearly so\.$"):
+        read_problem(tmp_path / "zzzzzz")
+    with pytest.raises(ProblemFileError, match=r"The folder .*nowhere does not exist either\.$"):
+        read_problem(tmp_path / "nowhere" / "G1.txt")
+    with pytest.raises(ProblemFileError, match=r"cannot be read \(Is a directory\)"):
+        read_problem(tmp_path)
+
+
+def test_settings_are_refused(write):
+    path = write("G.txt", "2 0\n")
+    with pytest.raises(SettingError, match="format = 'gest' is not allowed: expected one of 'gset', 'beasley'"):
+        read_problem(path, "gest")
+    with pytest.raises(
+        SettingError, match="maximise = True is not allowed: expected false for a file of format 'cnf'"
+    ):
+        read_problem(write("a.cnf", "p cnf 1 1\n1 0\n"), maximise=True)
+
+
+def test_no_two_formats_share_a_suffix():
+    suffixes = [suffix for format_ in FORMATS.values() for suffix in format_.suffixes]
+    assert len(suffixes) == len(set(suffixes))
+
+
+# ------------------------------------------------------------------------------------------------ solutions
+
+
+def test_solution_in_json(write, tmp_path):
+    problem = read_problem(write("b.sparse", "3 4\n" + "\n".join(f"{i} {j} {q}" for (i, j), q in ENTRIES.items())))
+    assert isinstance(problem.problem, Qubo)
+    solution = BruteForce().minimise(problem.problem, generator=rng.stream(0, "solver"))
+    write_solution(tmp_path / "s.json", problem, solution, solver={"max_variables": 22}, seed=5)
+    content = json.loads((tmp_path / "s.json").read_text())
+    best = min(states(3).tolist(), key=quadratic)
+    assert content == {
+        "problem": {
+            "file": str(problem.path),
+            "name": "b",
+            "format": "beasley",
+            "n_variables": 3,
+            "n_couplings": 2,
+        },
+        "energy": quadratic(best),
+        "objective": {"name": "x'Qx", "direction": "minimise", "value": quadratic(best)},
+        "assignment": best,
+        "restarts": {"energy": [quadratic(best)], "status": ["OPTIMAL"], "steps": [8]},
+        "wall_time_s": solution.wall_time_s,
+        "solver": {"max_variables": 22},
+        "seed": 5,
+        "memcomp_lightning": __version__,
+    }
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
+
+
+def solution_of(energies, assignments):
+    n_restarts = len(energies)
+    return QuboSolution(
+        assignments=torch.tensor(assignments),
+        energies=torch.tensor(energies, dtype=torch.float64),
+        status=torch.tensor([Status.STEP_BUDGET] * (n_restarts - 1) + [Status.NOT_RUN]),
+        steps=torch.tensor([7] * (n_restarts - 1) + [0]),
+        wall_time_s=0.5,
+    )
+
+
+def test_restarts_that_were_not_run_and_broken_hard_clauses_in_json(write, tmp_path):
+    problem = read_problem(write("a.wcnf", "h 1 0\n2 -1 2 0\n1 -2 0\n"))
+    solution = solution_of([5.0, 4.0, math.inf], [[0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
+    write_solution(tmp_path / "s.json", problem, solution, solver={}, seed=0)
+    content = json.loads((tmp_path / "s.json").read_text(), parse_constant=pytest.fail)
+    assert content["restarts"]["energy"] == [5.0, 4.0, None]
+    assert content["restarts"]["status"] == ["STEP_BUDGET", "STEP_BUDGET", "NOT_RUN"]
+    assert content["objective"]["value"] == 0
+    assert content["objective"]["hard_clauses_unsatisfied"] == 1
+    assert content["problem"]["n_hard_clauses"] == 1
+
+
+def test_solution_of_several_problems_is_refused(write, tmp_path):
+    problem = read_problem(write("G.txt", "2 1\n1 2 1\n"))
+    solution = solution_of([0.0, 0.0], [[0.0, 0.0], [0.0, 0.0]])
+    several = QuboSolution(
+        solution.assignments[None], solution.energies[None], solution.status[None], solution.steps[None], 0.0
+    )
+    with pytest.raises(SettingError, match=r"\(1, 2\) is not allowed: expected \(n_restarts,\)"):
+        write_solution(tmp_path / "s.json", problem, several, solver={}, seed=0)
+
+
+# ------------------------------------------------------------------------------------------------ real files
+
+
+@needs_qubo_files
+@pytest.mark.parametrize(
+    ("name", "n", "m"),
+    [
+        ("G1.txt", 800, 19176),
+        ("G14.txt", 800, 4694),
+        ("G22.txt", 2000, 19990),
+        ("G32.txt", 2000, 4000),
+        ("G43.txt", 1000, 9990),
+        ("G55.txt", 5000, 12498),
+    ],
+)
+def test_sizes_of_the_gset(name, n, m):
+    assert read_problem(DATA / name).sizes == {"variables": n, "couplings": m}
