@@ -57,7 +57,8 @@ def collective_mode(graph: Graph, coupling: Tensor) -> Tensor:
         x = graph.field(coupling, x)
     before = x.norm(dim=-1, keepdim=True)
     x = graph.field(coupling, x / before.clamp(min=_SMALLEST_RATIO))
-    return (2 / x.norm(dim=-1).squeeze(-1).clamp(min=_SMALLEST_RATIO)).clamp(max=1)
+    largest = x.norm(dim=-1).squeeze(-1)
+    return torch.clamp(2 / largest.clamp(min=_SMALLEST_RATIO), max=1)
 
 
 _POWER_ITERATIONS = 5

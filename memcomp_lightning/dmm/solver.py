@@ -21,7 +21,7 @@ from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.kernels import reference
 from memcomp_lightning.dmm.kernels.run import Run, Start
 from memcomp_lightning.errors import require, require_choice, require_count
-from memcomp_lightning.qubo.graph import Bipartite
+from memcomp_lightning.qubo.graph import Bipartite, EdgeList
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status, Trajectory
 
@@ -126,9 +126,9 @@ class DmmSolver:
             generator: For the initial voltages and the noise.
         """
         begin = time.perf_counter()
-        flat = _flatten(problem)
+        flat = _flatten(_without_zeros(problem))
         n_problems, n, device = flat.offset.shape[0], flat.n, flat.offset.device
-        n_steps = self.max_steps or default_steps(problem)
+        n_steps = self.max_steps or default_steps(flat)
         group_size = self.patience or self.n_restarts
         best = torch.zeros(n_problems, self.n_restarts, n, dtype=torch.bool, device=device)
         energies = torch.full((n_problems, self.n_restarts), torch.inf, dtype=torch.float64, device=device)
@@ -219,7 +219,7 @@ class DmmSolver:
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
     """Steps a restart, by the rule ``4 n^(3/4)`` of the number of variables, at least 100."""
-    return max(100, round(4 * problem.n**0.75))
+    return max(100, round(4 * math.pow(problem.n, 0.75)))
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:
@@ -258,6 +258,22 @@ def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> 
         offset=change(problem.offset),
         longer=tuple(dataclasses.replace(block, weight=change(block.weight)) for block in problem.longer),
     )
+
+
+def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
+    """Two layers of which few variables are coupled, as a list of the couplings that are there."""
+    if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
+        return problem
+    used = (problem.coupling != 0).reshape(-1, *problem.graph.edge_shape).any(0).flatten()
+    if used.sum() > _SPARSE * used.numel():
+        return problem
+    flat = problem.coupling.reshape(*problem.problems, -1)
+    pairs = problem.graph.edges().to(used.device)[used]
+    return dataclasses.replace(problem, graph=EdgeList(n=problem.n, pairs=pairs), coupling=flat[..., used])
+
+
+_SPARSE = 0.25
+"""Share of couplings below which a list is faster than a matrix."""
 
 
 def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
