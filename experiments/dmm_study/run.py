@@ -110,7 +110,6 @@ def memories(study: Study) -> None:
         "- short-term memory frozen at x_s(0)": lambda: DmmSolver(field=replace(clause, beta=1e-9)),
         "- zeta = 0": lambda: DmmSolver(field=replace(clause, zeta=0.0)),
         "- with noise 0.3": lambda: DmmSolver(field=replace(clause, noise=0.3)),
-        "- without noise": lambda: DmmSolver(field=replace(clause, noise=0.0)),
         "- voltages alone, no quench": lambda: DmmSolver(field=clause, quench_every=0),
         "- quench alone: machine stopped after one step": lambda: DmmSolver(field=clause, max_steps=1),
         "bond dynamics": lambda: DmmSolver(field=bond),
