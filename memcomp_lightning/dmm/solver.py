@@ -214,25 +214,37 @@ class DmmSolver:
             return f"The problem is on {device}: the plain torch kernel runs there."
         if importlib.util.find_spec("numba") is None:
             return "numba is not installed: the plain torch kernel is many times slower. pip install numba"
-        return None
+        return _import_failure()
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps a restart, by the rule ``4 n^(3/4)`` of the number of variables, at least 100."""
-    return max(100, round(4 * math.pow(problem.n, 0.75)))
+    """Steps a restart, by the rule ``3 n^(4/5)`` of the number of variables, at least 50."""
+    return max(50, round(3 * math.pow(problem.n, 0.8)))
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps between two readings: 1 for two coupled layers, else by the rule ``12 n / n_pairs``, at least 4.
+    """Steps between two readings: 2 for two coupled layers, else by the rule ``12 n / n_pairs``, at least 4.
 
     A step costs as much as the pairs, a descent as much as the variables and its flips, which are cheap where the
     couplings are a matrix.
     """
     if isinstance(problem.graph, Bipartite):
-        return 1
+        return 2
     n_pairs = math.prod(problem.graph.edge_shape)
     n_pairs += 0 if isinstance(problem, Qubo) else sum(len(block.variables) for block in problem.longer)
     return max(4, round(12 * problem.n / max(n_pairs, 1)))
+
+
+@cache
+def _import_failure() -> str | None:
+    """Why the compiled kernels cannot be loaded; None if they can."""
+    try:
+        from memcomp_lightning.dmm.kernels import cpu  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
+        return (
+            f"numba: {error}. The plain torch kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
+        )
+    return None
 
 
 @cache

@@ -1,8 +1,8 @@
 """The compiled kernels: hand tensors to numba and share the restarts among threads."""
 
 import logging
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import os
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -67,7 +67,8 @@ def _run_rows(
     memories = _memories(((*voltage.shape[:2], *coupling.shape[1:]), voltage.shape), start.kept)
     out = _outputs((n_problems, n_restarts), n, steps)
     state = (voltage, *memories, _seeds(start.seed))
-    _share(rows.integrate_all, n_problems * n_restarts, (arrays, control, state, steps, *out))
+    work = coupling.size * n_restarts * steps[0]
+    _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
     return _finish(out, voltage, memories, steps)
 
 
@@ -95,7 +96,8 @@ def _run_lanes(
     own = (sparse.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
     arrays = (*own, longer, sparse.digital, sparse.linear)
     state = (voltage, *memories, seed)
-    _share(lanes.integrate_all, n_problems * n_blocks, (arrays, control, state, steps, *out))
+    work = (sparse.weight.size + sparse.longer_weight.size) * n_restarts * steps[0]
+    _share(lanes.integrate_all, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
     out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
     final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
     return _finish(out, final[0], final[1:], steps)
@@ -255,20 +257,37 @@ def _pool(n_threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n_threads, thread_name_prefix="memcomp-dmm")
 
 
-def _share(kernel: Callable[..., None], n_items: int, arguments: tuple[Any, ...]) -> None:
-    """Run items 0 to ``n_items - 1`` on as many threads as torch uses."""
+# Threads do not survive a fork: a child process makes its own.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -> None:
+    """Run items 0 to ``n_items - 1`` on as many threads as torch uses; ``work`` counts pairs x steps x restarts.
+
+    Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
+    """
     _announce(kernel)
+    stop = np.zeros(1, np.uint8)
     n_threads = min(torch.get_num_threads(), n_items)
-    if n_threads <= 1:
-        kernel(0, n_items, *arguments)
+    if n_threads <= 1 and work < _SHORT:
+        kernel(0, n_items, stop, *arguments)
         return
-    # The kernel is compiled by the first call: one item on this thread, so that threads do not all compile it.
+    if not kernel.signatures:
+        kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
     cuts = np.linspace(0, n_items, min(n_items, 4 * n_threads) + 1).astype(int).tolist()
-    if not kernel.signatures:  # type: ignore[attr-defined]
-        kernel(0, 0, *arguments)
-    jobs = [_pool(n_threads).submit(kernel, a, b, *arguments) for a, b in pairwise(cuts)]
-    for job in jobs:
-        job.result()
+    jobs = [_pool(n_threads).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
+    try:
+        for job in jobs:
+            job.result()
+    except BaseException:
+        stop[0] = 1
+        wait(jobs)
+        raise
+
+
+_SHORT = 2e8
+"""Work of less than about a second."""
 
 
 @cache

@@ -296,12 +296,13 @@ def keep_best(x, energy, lowest, found_at, best, step):
 
 
 @njit(nogil=True, cache=True)
-def integrate_all(begin, end, problem, control, start, steps, best, found_at, times, states):
+def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, times, states):
     """Integrate the blocks of restarts numbered ``begin`` to ``end - 1``, problem by problem.
 
     Args:
         begin: First block.
         end: Behind the last block.
+        stop: One number; anything but 0 ends the integration at the next step.
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
         control: (max_change, dt_min, dt_max, noise), a problem each.
@@ -318,6 +319,8 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
     voltage, long, unit_long, longer_long, seed = start
     n_blocks = voltage.shape[1]
     for item in range(begin, end):
+        if stop[0] != 0:
+            return
         p, b = item // n_blocks, item % n_blocks
         found_at[p, b] = integrate(
             (kind, pairs, weight[p], polarity[p], unit[p], variables, longer_polarity, longer_weight[p]),
@@ -337,6 +340,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
             control[p],
             (voltage[p, b], long[p, b], unit_long[p, b], longer_long[p, b], seed[p, b]),
             steps,
+            stop,
             best[p, b],
             times[p, b],
             states[p, b],
@@ -344,7 +348,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def integrate(problem, digital, linear, c, control, start, steps, best, times, states):
+def integrate(problem, digital, linear, c, control, start, steps, stop, best, times, states):
     """Integrate the lanes of a block; return the step at which each one's ``best`` was met, 0 for the start.
 
     Args:
@@ -357,6 +361,7 @@ def integrate(problem, digital, linear, c, control, start, steps, best, times, s
         start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
         steps: (n_steps, quench_every, record_every); quench_every = 0 reads each step without a quench.
+        stop: One number; anything but 0 ends the integration.
         best: ``(lanes, n)``, out: the assignments of lowest energy.
         times: ``(lanes, n_records)``, out.
         states: ``(lanes, n_records, n)``, out.
@@ -429,7 +434,7 @@ def integrate(problem, digital, linear, c, control, start, steps, best, times, s
             longer_pass(
                 longer_variables, longer_polarity, longer_weight, longer_memory, voltage, rate, falsehood, c, dt
             )
-        if step == n_steps:
+        if step == n_steps or stop[0] != 0:
             break
         fastest[:] = F32(1e-30)
         for i in range(n):

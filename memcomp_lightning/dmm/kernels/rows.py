@@ -183,12 +183,13 @@ def quench(coupling, transposed, x, field):
 
 
 @njit(nogil=True, cache=True)
-def integrate_all(begin, end, problem, control, start, steps, best, found_at, times, states):
+def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, times, states):
     """Integrate the restarts numbered ``begin`` to ``end - 1``, problem by problem.
 
     Args:
         begin: First restart.
         end: Behind the last restart.
+        stop: One number; anything but 0 ends the integration at the next step.
         problem: (kind, constants, weight, unit, coupling, transposed, linear), the last six a problem each.
         control: (max_change, dt_min, dt_max, noise), a problem each.
         start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``.
@@ -202,6 +203,8 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
     voltage, long, unit_long, seed = start
     n_restarts = voltage.shape[1]
     for item in range(begin, end):
+        if stop[0] != 0:
+            return
         p, r = item // n_restarts, item % n_restarts
         found_at[p, r] = integrate(
             (kind, weight[p], unit[p], coupling[p], transposed[p], linear[p]),
@@ -212,6 +215,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
             unit_long[p, r],
             seed[p, r],
             steps,
+            stop,
             best[p, r],
             times[p, r],
             states[p, r],
@@ -219,7 +223,7 @@ def integrate_all(begin, end, problem, control, start, steps, best, found_at, ti
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, times, states):
+def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, best, times, states):
     """Integrate one restart; return the step at which ``best`` was met, 0 for the initial state.
 
     Args:
@@ -231,6 +235,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
         unit_long: Those of the unit clauses or fields, ``(n,)``, in and out.
         seed: Of the noise.
         steps: (n_steps, quench_every, record_every); quench_every = 0 reads each step without a quench.
+        stop: One number; anything but 0 ends the integration.
         best: ``(n,)``, out: the assignment of lowest energy.
         times: ``(n_records,)``, out.
         states: ``(n_records, n)``, out.
@@ -297,7 +302,7 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, best, 
         else:
             clause_pass(weight, board, short, long, voltage, drive, c, dt)
             clause_units(unit, unit_long, voltage, drive, c, dt)
-        if step == n_steps:
+        if step == n_steps or stop[0] != 0:
             break
         fastest = F32(1e-30)
         for i in range(n):
