@@ -184,6 +184,12 @@ class Trajectory(NamedTuple):
     assignments: Tensor
     dwell: Tensor
 
+    def low_energy_dwell(self) -> Tensor:
+        """``dwell`` of the low-energy stretch of each restart: 0 before its weight first falls to its median."""
+        weight = self.unsatisfied_weight
+        reached = (weight <= weight.median(-1, keepdim=True).values).cummax(-1).values
+        return self.dwell * reached
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuboSolution:

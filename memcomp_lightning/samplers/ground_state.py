@@ -20,8 +20,8 @@ class GroundState:
     Attributes:
         solver: Finds low energies of the QUBO.
         readout: "best" uses the best assignment x* as a one-point distribution, as the paper's figures do;
-            "time_average" weights the assignments of the recorded trajectory by the time spent in them, the
-            paper's <x(t)>, and needs a solver that records one.
+            "time_average" weights the assignments of the recorded trajectory by the time spent in them, over
+            the low-energy stretch of each restart, the paper's <x(t)>, and needs a solver that records one.
     """
 
     uses_data: ClassVar[bool] = False
@@ -60,12 +60,12 @@ class GroundState:
 
 
 def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Assignments of all records of all restarts, and the time spent in each."""
+    """Assignments of all records of all restarts, and the time spent in each of the low-energy stretches."""
     if solution.trajectory is None:
         raise ValueError(
             "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
         )
-    assignments, dwell = solution.trajectory.assignments, solution.trajectory.dwell
+    assignments, dwell = solution.trajectory.assignments, solution.trajectory.low_energy_dwell()
     return assignments.flatten(-3, -2).to(dtype), dwell.flatten(-2).to(dtype)
 
 
