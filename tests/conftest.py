@@ -37,6 +37,19 @@ with install_import_hook(HOOKED, "memcomp_lightning_tests.check_shapes"):
 torch.set_num_threads(1)
 
 
+def pytest_sessionstart(session):
+    """Compile the DMM kernels before there are several workers, each of which would; later runs load them."""
+    options = session.config.option
+    if getattr(options, "numprocesses", None) and not options.collectonly:
+        from memcomp_lightning import rng
+        from memcomp_lightning.dmm import DmmSolver
+        from memcomp_lightning.qubo import Qubo, from_model
+        from memcomp_lightning.testing.conformance import small_rbm
+
+        for problem in (from_model(small_rbm()), Qubo.from_matrix(torch.ones(2, 2))):
+            DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=rng.stream(0, "compile"))
+
+
 @contextlib.contextmanager
 def _global_rng_untouched():
     torch_before, numpy_before = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002

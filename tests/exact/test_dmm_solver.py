@@ -1,15 +1,38 @@
 """Optima, stopping rule, records and readout of the DMM solver."""
 
+import dataclasses
+import importlib.util
+import itertools
+import logging
+import math
+import resource
 from typing import NamedTuple
 
 import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import AdaptiveEuler, DmmSolver, Recording
+from memcomp_lightning.dmm import (
+    AdaptiveEuler,
+    BondField,
+    ClauseField,
+    DmmSolver,
+    ExactShortTerm,
+    Heun,
+    Recording,
+    Splitting,
+    Strang,
+    WarmRestart,
+)
+from memcomp_lightning.dmm import (
+    solver as solver_module,
+)
+from memcomp_lightning.dmm.kernels import cpu, reference
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
+from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import BruteForce, Qubo, Status, from_model, from_qubo
+from memcomp_lightning.qubo import BruteForce, Qubo, Status, WeightedMaxSat, from_model, from_qubo
 from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
 
@@ -26,6 +49,10 @@ def minimum(qubo):
     return solve(BruteForce(), qubo).best_energy
 
 
+either_kernel = pytest.mark.parametrize("kernel", ["compiled", "reference"])
+either_field = pytest.mark.parametrize("field", [ClauseField(), BondField()], ids=["clauses", "bonds"])
+
+
 # --- optima -----------------------------------------------------------------------------------------------
 
 
@@ -38,8 +65,10 @@ def minimum(qubo):
     ],
     ids=["dense", "models", "strong couplings"],
 )
-def test_finds_the_optimum_of_random_problems(qubo):
-    solution = solve(DmmSolver(n_restarts=13, max_steps=307), qubo)
+@either_field
+@pytest.mark.parametrize("quench_every", [0, None])
+def test_finds_the_optimum_of_random_problems(qubo, field, quench_every):
+    solution = solve(DmmSolver(field=field, n_restarts=13, max_steps=307, quench_every=quench_every), qubo)
     torch.testing.assert_close(solution.best_energy, minimum(qubo), rtol=1e-12, atol=1e-12)
 
 
@@ -66,20 +95,23 @@ def test_finds_the_optimum_of_trained_models(sampler):
     rbm = trained(sampler)
     assert rbm.weight.abs().max() > 1
     qubo = from_model(rbm)
-    solution = solve(DmmSolver(n_restarts=28, max_steps=307), qubo)
-    torch.testing.assert_close(solution.best_energy, minimum(qubo), rtol=1e-12, atol=1e-12)
+    for field in (ClauseField(), BondField()):
+        solution = solve(DmmSolver(field=field, n_restarts=28, max_steps=307, quench_every=0), qubo)
+        torch.testing.assert_close(solution.best_energy, minimum(qubo), rtol=1e-12, atol=1e-12)
 
 
-def test_energies_are_those_of_the_assignments():
+@either_kernel
+@either_field
+def test_energies_are_those_of_the_assignments(field, kernel):
     qubo = from_model(small_rbm(replicas=(2, 3)))
-    solution = solve(DmmSolver(n_restarts=5, max_steps=3), qubo)
+    solution = solve(DmmSolver(field=field, n_restarts=5, max_steps=3, quench_every=0, kernel=kernel), qubo)
     assert solution.energies.equal(qubo.energy(solution.assignments))
     assert (solution.energies.amax(-1) > solution.energies.amin(-1)).any()
 
 
 def test_more_steps_never_give_a_higher_energy():
     qubo = Qubo.from_matrix(normal(3, 11, 11))
-    few, many = (solve(DmmSolver(n_restarts=7, max_steps=n), qubo).energies for n in (2, 41))
+    few, many = (solve(DmmSolver(n_restarts=7, max_steps=n, quench_every=0), qubo).energies for n in (2, 41))
     assert (many <= few).all()
     assert (many < few).any()
 
@@ -87,22 +119,29 @@ def test_more_steps_never_give_a_higher_energy():
 # --- streams and shapes -----------------------------------------------------------------------------------
 
 
+@either_kernel
+@either_field
 @pytest.mark.parametrize("patience", [None, 2])
-def test_same_stream_gives_the_same_solution_and_another_one_another(patience):
-    solver = DmmSolver(n_restarts=5, patience=patience, max_steps=11, record=Recording(every=3))
+def test_same_stream_gives_the_same_solution_and_another_one_another(patience, field, kernel):
+    solver = DmmSolver(
+        field=field, n_restarts=5, patience=patience, max_steps=11, record=Recording(every=3), kernel=kernel
+    )
     qubo = Qubo.from_matrix(normal(3, 11, 11))
     first, again, other = (solve(solver, qubo, seed) for seed in (0, 0, 1))
     assert first.assignments.equal(again.assignments)
     assert first.energies.equal(again.energies)
     assert first.status.equal(again.status)
     assert all(a.equal(b) for a, b in zip(first.trajectory, again.trajectory, strict=True))
-    assert not first.trajectory.time.equal(other.trajectory.time)
+    assert not first.trajectory.assignments.equal(other.trajectory.assignments)
 
 
+@either_kernel
+@either_field
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("problems", [(), (1,), (3,), (2, 3)], ids=str)
-def test_shapes(problems):
-    qubo = Qubo.from_matrix(normal(*problems, 7, 7))
-    solution = solve(DmmSolver(n_restarts=5, max_steps=11), qubo)
+def test_shapes(problems, dtype, field, kernel):
+    qubo = Qubo.from_matrix(normal(*problems, 7, 7).to(dtype))
+    solution = solve(DmmSolver(field=field, n_restarts=5, max_steps=11, kernel=kernel), qubo)
     assert solution.assignments.shape == (*problems, 5, 7)
     assert solution.energies.shape == solution.status.shape == solution.steps.shape == (*problems, 5)
     assert solution.best.shape == (*problems, 7)
@@ -111,8 +150,9 @@ def test_shapes(problems):
     assert solution.assignments.dtype == qubo.linear.dtype
 
 
-def test_single_problem_equals_a_batch_of_one():
-    matrix, solver = normal(7, 7), DmmSolver(n_restarts=5, max_steps=23)
+@either_kernel
+def test_single_problem_equals_a_batch_of_one(kernel):
+    matrix, solver = normal(7, 7), DmmSolver(n_restarts=5, max_steps=23, kernel=kernel)
     single, batch = solve(solver, Qubo.from_matrix(matrix)), solve(solver, Qubo.from_matrix(matrix[None]))
     assert single.assignments.equal(batch.assignments[0])
     assert single.energies.equal(batch.energies[0])
@@ -128,8 +168,12 @@ class Voltages(NamedTuple):
 class ScriptedField:
     """Restart r of problem p stays at the assignment that reads ``table[p][r]`` in binary.
 
-    The problem is known by its unit clauses, which the script's QUBO numbers.
+    The problem is known by its linear terms, which the script's QUBO numbers.
     """
+
+    integrator = AdaptiveEuler()
+    noise = 0.0
+    spread = 1.0
 
     def __init__(self, table):
         self.table = torch.tensor(table)
@@ -141,10 +185,14 @@ class ScriptedField:
         pair = torch.zeros(len(self.table), 3, 3)
         return Qubo.from_matrix(torch.diag_embed(linear) + pair)
 
-    def build(self, maxsat):
-        return (-maxsat.unit[:, 2] - 1).long()
+    def build(self, problem):
+        return (problem.linear[:, 2] - 1).long()
 
-    def init(self, machine, n_restarts, *, generator):
+    def stability(self, machine):
+        return torch.ones(len(machine), 1)
+
+    def init(self, machine, voltage):
+        n_restarts = voltage.shape[1]
         numbers = self.table[machine, self.done : self.done + n_restarts]
         self.done += n_restarts
         bits = (numbers[..., None] >> torch.tensor([2, 1, 0])) & 1
@@ -181,7 +229,9 @@ def test_stops_by_the_rule_problem_by_problem(patience):
     draw = rng.uniform((29, 7), generator=rng.stream(0, "test draws"))
     table = [*(8 * draw).long().tolist(), [7, 6, 5, 4, 3, 2, 1], [3] * 7, [0, 1, 2, 3, 4, 5, 6]]
     field = ScriptedField(table)
-    solution = solve(DmmSolver(field=field, n_restarts=7, patience=patience, max_steps=2), field.qubo())
+    solution = solve(
+        DmmSolver(field=field, n_restarts=7, patience=patience, max_steps=2, quench_every=0), field.qubo()
+    )
     expected = [restarts_by_the_rule(row, patience) for row in table]
     if patience < 5:
         assert len(set(expected)) > 1
@@ -197,7 +247,7 @@ def test_stops_by_the_rule_problem_by_problem(patience):
 
 def test_without_patience_all_restarts_run():
     field = ScriptedField([[3] * 7, [5] * 7])
-    solution = solve(DmmSolver(field=field, n_restarts=7, max_steps=2), field.qubo())
+    solution = solve(DmmSolver(field=field, n_restarts=7, max_steps=2, quench_every=0), field.qubo())
     assert solution.energies.tolist() == [[3.0] * 7, [10.0] * 7]
     assert (solution.status != Status.NOT_RUN).all()
 
@@ -217,11 +267,11 @@ class LateField(ScriptedField):
     def qubo(self):
         return Qubo.from_matrix(torch.tensor([[-1.0]]))
 
-    def init(self, machine, n_restarts, *, generator):
-        return Voltages(torch.full((1, n_restarts, 1), -0.95))
+    def init(self, machine, voltage):
+        return Voltages(torch.full_like(voltage, -0.95))
 
-    def build(self, maxsat):
-        return None
+    def build(self, problem):
+        return torch.zeros(1)
 
     def derivative(self, machine, state):
         return Voltages(torch.ones_like(state.voltage))
@@ -239,10 +289,330 @@ class LateField(ScriptedField):
 def test_status_tells_when_the_best_came(max_steps, status, energy):
     field = LateField([[0]])
     steady = AdaptiveEuler(max_change=1.0, dt_min=0.1, dt_max=0.1)
-    solver = DmmSolver(field=field, integrator=steady, n_restarts=3, max_steps=max_steps)
+    solver = DmmSolver(field=field, integrator=steady, n_restarts=3, max_steps=max_steps, quench_every=0)
     solution = solve(solver, field.qubo())
     assert (solution.status == status).all()
     assert (solution.energies == energy).all()
+
+
+# --- steps, readings, warm restarts -----------------------------------------------------------------------
+
+
+class Call(NamedTuple):
+    problem: object
+    start: object
+    settings: dict
+    run: object
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """What the solver hands to the kernels and what it gets."""
+    seen = []
+
+    def watch(module):
+        run = module.run
+
+        def watched(field, integrator, problem, start, **settings):
+            result = run(field, integrator, problem, start, **settings)
+            seen.append(Call(problem, start, {"kernel": module, "integrator": integrator, **settings}, result))
+            return result
+
+        monkeypatch.setattr(module, "run", watched)
+
+    for module in (cpu, reference):
+        watch(module)
+    return seen
+
+
+def without_couplings(n):
+    none = torch.zeros(0, dtype=torch.int64)
+    return Qubo.from_coo(n, none, none, torch.zeros(0))
+
+
+@pytest.mark.parametrize("n", [1, 11, 1000])
+def test_number_of_steps_follows_the_problem_unless_it_is_set(n, calls):
+    solution = solve(DmmSolver(n_restarts=2), without_couplings(n))
+    assert solution.steps.tolist() == [solver_module.default_steps(without_couplings(n))] * 2
+    assert calls[-1].settings["n_steps"] == solution.steps[0]
+    assert solve(DmmSolver(n_restarts=2, max_steps=3), without_couplings(n)).steps.tolist() == [3, 3]
+
+
+def test_default_number_of_steps_grows_more_slowly_than_the_problem():
+    steps = [solver_module.default_steps(without_couplings(n)) for n in (1, 10, 100, 10**4, 4 * 10**4)]
+    assert steps == sorted(steps)
+    assert steps[0] >= 50
+    assert 1.3 < steps[-1] / steps[-2] < 4
+
+
+def test_readings_follow_the_problem_unless_they_are_set(calls):
+    for problem in (from_model(small_rbm()), Qubo.from_matrix(normal(7, 7)), without_couplings(5)):
+        solve(DmmSolver(n_restarts=2, max_steps=3), problem)
+        assert calls[-1].settings["quench_every"] == solver_module.default_quench(problem) >= 1
+        solve(DmmSolver(n_restarts=2, max_steps=3, quench_every=0), problem)
+        assert calls[-1].settings["quench_every"] == 0
+
+
+@either_kernel
+@either_field
+@pytest.mark.parametrize(
+    "problem", [from_model(small_rbm(23, 19, replicas=(2,))), Qubo.from_matrix(normal(2, 29, 29))]
+)
+def test_descents_never_make_the_answer_worse(problem, field, kernel):
+    plain, rare, often = (
+        solve(DmmSolver(field=field, n_restarts=11, max_steps=15, quench_every=k, kernel=kernel), problem).energies
+        for k in (0, 3, 1)
+    )
+    assert (often <= plain + 1e-6).all()
+    assert (often <= rare + 1e-6).all()
+    assert (often < plain - 1e-3).any()
+
+
+CREEPING = Splitting(max_change=0.1, dt_min=0.001, dt_max=0.2)
+
+
+@either_kernel
+@pytest.mark.parametrize(
+    "field",
+    [
+        ClauseField(alpha=5.0, beta=0.4, gamma=0.03, delta=0.01, epsilon=0.04, spread=1.0, integrator=CREEPING),
+        BondField(delta=4.0, zeta=1.0, long_term_max=2.0, noise=0.0, integrator=CREEPING),
+    ],
+    ids=["clauses", "bonds"],
+)
+@pytest.mark.parametrize("keep", [0.0, 0.5])
+def test_warm_restart_goes_on_from_where_the_last_of_its_row_ended(keep, field, kernel, calls):
+    """Problem by problem, also after those of no weight are done."""
+    matrix = normal(9, 29, 29)
+    matrix[::2] = 0
+    problem = Qubo.from_matrix(matrix, offset=torch.arange(9.0))
+    warm = WarmRestart(keep=keep, spread=0.3)
+    solution = solve(
+        DmmSolver(field=field, n_restarts=24, patience=4, max_steps=5, warm=warm, quench_every=0, kernel=kernel),
+        problem,
+    )
+    n_run = (solution.status != Status.NOT_RUN).sum(-1)
+    assert n_run.min() < n_run.max()
+    assert not calls[0].start.kept
+    assert calls[0].start.voltage.abs().max() <= field.spread
+    for before, after in itertools.pairwise(calls):
+        row = [before.problem.offset.tolist().index(offset) for offset in after.problem.offset.tolist()]
+        kick = after.start.voltage - before.run.voltage[row]
+        assert kick.abs().max() <= 0.3 + 1e-6
+        assert kick.std() > 0.1
+        assert after.start.voltage.abs().max() <= 1
+        for ours, theirs in zip(after.start.kept, before.run.kept, strict=True):
+            assert ours.equal(keep * theirs[row])
+    assert any((memory > 0).any() for memory in calls[-1].start.kept) == (keep > 0)
+    assert {len(call.problem.offset) for call in calls} > {9}
+
+
+@either_kernel
+def test_kept_memories_are_felt(kernel):
+    qubo = Qubo.from_matrix(normal(3, 13, 13))
+
+    def times(warm):
+        solver = DmmSolver(
+            n_restarts=8, patience=4, max_steps=15, warm=warm, record=Recording(every=1), kernel=kernel
+        )
+        return solve(solver, qubo).trajectory.time
+
+    forgetting, keeping, cold = (times(warm) for warm in (WarmRestart(keep=0.0), WarmRestart(keep=0.5), None))
+    assert forgetting[:, :4].equal(keeping[:, :4])
+    assert cold[:, :4].equal(keeping[:, :4])
+    assert not forgetting[:, 4:].equal(keeping[:, 4:])
+    assert not forgetting[:, 4:].equal(cold[:, 4:])
+
+
+@either_kernel
+@either_field
+def test_warm_restarts_find_the_optimum(field, kernel):
+    qubo = from_model(small_rbm(11, 7, replicas=(2, 3)))
+    solver = DmmSolver(field=field, n_restarts=24, patience=6, max_steps=101, warm=WarmRestart(), kernel=kernel)
+    torch.testing.assert_close(solve(solver, qubo).best_energy, minimum(qubo), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("patience", [None, 5])
+def test_warm_restarts_need_a_patience_that_divides_the_restarts(patience):
+    message = rf"warm = .* a patience that divides n_restarts = 28\..*Set patience \(now {patience}\)"
+    with pytest.raises(SettingError, match=message):
+        DmmSolver(n_restarts=28, patience=patience, warm=WarmRestart())
+
+
+# --- kernels ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [from_model(small_rbm()), Qubo.from_matrix(normal(7, 7)), from_qubo(Qubo.from_matrix(normal(7, 7)))],
+    ids=["model", "dense", "MAX-SAT"],
+)
+@either_field
+def test_the_compiled_kernel_runs_where_it_can(field, problem, calls):
+    solve(DmmSolver(field=field, n_restarts=2, max_steps=3), problem)
+    solve(DmmSolver(field=field, n_restarts=2, max_steps=3, kernel="reference"), problem)
+    solve(DmmSolver(field=field, integrator=Heun(), n_restarts=2, max_steps=3), problem)
+    assert [call.settings["kernel"] for call in calls] == [cpu, reference, reference]
+    assert [type(call.settings["integrator"]) for call in calls] == [Splitting, Splitting, Heun]
+
+
+class OtherClauseField(ClauseField):
+    """May change any equation."""
+
+
+@pytest.mark.parametrize("field", [ScriptedField([[0]]), OtherClauseField()])
+def test_compiled_kernel_of_another_field_is_refused(field):
+    message = (
+        rf"^kernel = 'compiled' is not allowed: expected 'auto' or 'reference' here. {type(field).__name__} has"
+    )
+    with pytest.raises(SettingError, match=message):
+        DmmSolver(field=field, kernel="compiled")
+
+
+@pytest.mark.parametrize("integrator", [AdaptiveEuler(), Heun(), Strang(), ExactShortTerm()])
+def test_compiled_kernel_of_another_integrator_is_refused_with_the_remedy(integrator):
+    with pytest.raises(SettingError, match=rf"{type(integrator).__name__} has no compiled kernel: use Splitting"):
+        DmmSolver(integrator=integrator, kernel="compiled")
+
+
+@pytest.fixture
+def no_numba(monkeypatch):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "numba" else find_spec(name, *rest)
+    )
+    solver_module._say_once.cache_clear()
+    yield
+    solver_module._say_once.cache_clear()
+
+
+@pytest.mark.usefixtures("no_numba")
+def test_without_numba_the_readable_kernel_runs_and_says_so_once(caplog):
+    caplog.set_level(logging.INFO, logger="memcomp_lightning")
+    qubo = from_model(small_rbm(replicas=(2,)))
+    first, again = (solve(DmmSolver(n_restarts=5, max_steps=23), qubo) for _ in range(2))
+    plain = solve(DmmSolver(n_restarts=5, max_steps=23, kernel="reference"), qubo)
+    assert [record.message for record in caplog.records if "pip install numba" in record.message] == [
+        "numba is not installed: the plain torch kernel is many times slower. pip install numba"
+    ]
+    for solution in (first, again):
+        assert solution.assignments.equal(plain.assignments)
+        assert solution.status.equal(plain.status)
+
+
+@pytest.mark.usefixtures("no_numba")
+def test_without_numba_the_compiled_kernel_is_refused_with_the_remedy():
+    with pytest.raises(SettingError, match=r"kernel = 'compiled' .* numba is not installed.* pip install numba"):
+        DmmSolver(kernel="compiled")
+
+
+@either_field
+def test_sparse_layers_are_solved_as_a_list_of_couplings(field, calls):
+    qubo = from_model(small_rbm(9, 8, replicas=(2,)))
+    used = torch.zeros(8, 9, dtype=torch.bool)
+    used[torch.arange(8), torch.arange(8)] = used[0, 4] = True
+    sparse = dataclasses.replace(qubo, coupling=qubo.coupling * used)
+    solution = solve(DmmSolver(field=field, max_steps=53), sparse)
+    assert calls[-1].problem.graph.edges().shape == (9, 2)
+    torch.testing.assert_close(solution.best_energy, minimum(sparse), rtol=1e-12, atol=1e-12)
+    assert solution.energies.equal(sparse.energy(solution.assignments))
+    solve(DmmSolver(field=field, max_steps=3), qubo)
+    assert calls[-1].problem.graph == qubo.graph
+
+
+# --- MAX-SAT ----------------------------------------------------------------------------------------------
+
+
+def clauses(n, lengths, seed):
+    """Random clauses of each length, as many as the number beside it."""
+    generator = rng.stream(seed, "clauses")
+    rows = []
+    for length, number in lengths.items():
+        for draw in rng.uniform((number, n), generator=generator):
+            variables = draw.argsort()[:length] + 1
+            signs = torch.where(rng.uniform((length,), generator=generator) < 0.5, -1, 1)
+            rows.append((variables * signs).tolist())
+    return rows, (0.1 + rng.uniform((len(rows),), generator=generator)).tolist()
+
+
+MAXSAT = {
+    "units and pairs": (13, {1: 9, 2: 40}),
+    "3-SAT": (13, {3: 80}),
+    "all lengths": (11, {0: 1, 1: 5, 2: 15, 3: 30, 4: 15, 5: 10, 7: 3}),
+    "one clause": (5, {4: 1}),
+    "units": (7, {1: 11}),
+}
+
+
+@either_kernel
+@pytest.mark.parametrize("quench_every", [0, None])
+@pytest.mark.parametrize("name", MAXSAT)
+def test_finds_the_optimum_of_maxsat(name, quench_every, kernel):
+    n, lengths = MAXSAT[name]
+    problem = WeightedMaxSat.from_clauses(n, *clauses(n, lengths, seed=1), offset=0.7)
+    solution = solve(DmmSolver(max_steps=307, quench_every=quench_every, kernel=kernel), problem)
+    expected = problem.energy(binary_states(n, like=problem.unit)).min()
+    torch.testing.assert_close(solution.best_energy, expected, rtol=1e-12, atol=1e-12)
+    assert solution.energies.equal(problem.energy(solution.assignments))
+    assert solution.assignments.dtype == problem.unit.dtype
+
+
+@either_kernel
+def test_bonds_find_the_optimum_of_maxsat_with_two_literals(kernel):
+    problem = WeightedMaxSat.from_clauses(13, *clauses(13, {1: 9, 2: 40}, seed=2))
+    solution = solve(DmmSolver(field=BondField(), max_steps=307, kernel=kernel), problem)
+    expected = problem.energy(binary_states(13, like=problem.unit)).min()
+    torch.testing.assert_close(solution.best_energy, expected, rtol=1e-12, atol=1e-12)
+
+
+@either_kernel
+def test_maxsat_problems_of_one_shape_are_solved_together(kernel):
+    one = WeightedMaxSat.from_clauses(9, *clauses(9, {1: 4, 2: 12, 3: 20, 4: 8}, seed=3))
+    factor = rng.uniform((2, 3, 1), generator=rng.stream(0, "weights"))
+    many = dataclasses.replace(
+        one,
+        weight=factor * one.weight.flip(0) + (1 - factor) * one.weight,
+        unit=factor * one.unit,
+        offset=factor.squeeze(-1).double(),
+        longer=tuple(
+            dataclasses.replace(block, weight=factor * block.weight.flip(0) + (1 - factor) * block.weight)
+            for block in one.longer
+        ),
+    )
+    solver = DmmSolver(n_restarts=12, patience=4, max_steps=211, record=Recording(every=20), kernel=kernel)
+    solution = solve(solver, many)
+    states = binary_states(9, like=one.unit).expand(2, 3, -1, -1)
+    torch.testing.assert_close(solution.best_energy, many.energy(states).amin(-1), rtol=1e-12, atol=1e-12)
+    assert solution.assignments.shape == (2, 3, 12, 9)
+    visited = solution.trajectory.assignments
+    recorded = many.unsatisfied_weight(visited.flatten(-3, -2)).reshape(visited.shape[:-1])
+    run = solution.status != Status.NOT_RUN
+    torch.testing.assert_close(solution.trajectory.unsatisfied_weight[run], recorded[run])
+
+
+@either_kernel
+def test_clauses_of_three_literals_are_refused_by_the_bonds_with_the_remedy(kernel):
+    problem = WeightedMaxSat.from_clauses(5, [[1, 2], [-1, 3, 4]], [1.0, 1.0])
+    with pytest.raises(SettingError, match=r"longest clause = 3 .* at most 2 literals.*field=ClauseField\(\)"):
+        solve(DmmSolver(field=BondField(), kernel=kernel), problem)
+
+
+# --- size -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kernel", "quench_every"), [("compiled", None), ("reference", 0)])
+@either_field
+def test_memory_is_linear_in_the_couplings(field, kernel, quench_every):
+    """A matrix of these 100,000 variables would have 40 GB."""
+    n, n_pairs = 100_000, 200_000
+    generator = rng.stream(0, "pairs")
+    rows, columns = (torch.randint(n, (n_pairs,), generator=generator) for _ in range(2))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    qubo = Qubo.from_coo(n, rows, columns, normal(n_pairs))
+    solver = DmmSolver(field=field, n_restarts=2, max_steps=4, quench_every=quench_every, kernel=kernel)
+    solution = solve(solver, qubo)
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 < 2e9
+    assert solution.energies.max() < -0.3 * math.sqrt(n)
 
 
 # --- records ----------------------------------------------------------------------------------------------
@@ -254,17 +624,19 @@ def recorded(problems=(2,), every=5, max_steps=23, **settings):
     return qubo, solve(solver, qubo)
 
 
+@either_kernel
 @pytest.mark.parametrize("problems", [(), (2,), (2, 3)], ids=str)
-def test_record_shapes(problems):
-    trajectory = recorded(problems)[1].trajectory
+def test_record_shapes(problems, kernel):
+    trajectory = recorded(problems, kernel=kernel)[1].trajectory
     assert trajectory.time.shape == trajectory.dwell.shape == (*problems, 11, 4)
     assert trajectory.unsatisfied_weight.shape == (*problems, 11, 4)
     assert trajectory.assignments.shape == (*problems, 11, 4, 7)
     assert trajectory.assignments.dtype == torch.bool
 
 
-def test_dwell_times_add_up_to_the_time():
-    trajectory = recorded()[1].trajectory
+@either_kernel
+def test_dwell_times_add_up_to_the_time(kernel):
+    trajectory = recorded(kernel=kernel)[1].trajectory
     assert (trajectory.dwell > 0).all()
     torch.testing.assert_close(trajectory.dwell.cumsum(-1), trajectory.time, rtol=1e-12, atol=0)
 
@@ -275,32 +647,52 @@ def test_time_is_the_sum_of_the_step_sizes():
     assert trajectory.time.equal(torch.tensor([1.25, 2.5, 3.75, 5.0]).double().expand(2, 11, 4))
 
 
-def test_unsatisfied_weight_is_that_of_the_assignments():
-    qubo, solution = recorded()
+@either_kernel
+def test_unsatisfied_weight_is_that_of_the_assignments(kernel):
+    qubo, solution = recorded(kernel=kernel)
     states = solution.trajectory.assignments.flatten(-3, -2)
     expected = from_qubo(qubo).unsatisfied_weight(states).unflatten(-1, (11, 4))
     torch.testing.assert_close(solution.trajectory.unsatisfied_weight, expected, rtol=1e-5, atol=1e-5)
     assert expected.std() > 0.1
 
 
-def test_best_is_the_lowest_of_the_records_when_every_step_is_recorded():
-    qubo, solution = recorded(every=1)
+@either_kernel
+def test_best_is_the_lowest_of_the_records_when_every_step_is_recorded(kernel):
+    qubo, solution = recorded(every=1, kernel=kernel, quench_every=0)
     energies = qubo.energy(solution.trajectory.assignments.flatten(-3, -2)).unflatten(-1, (11, 23))
     assert (solution.energies <= energies.amin(-1)).all()
     assert (solution.energies == energies.amin(-1)).float().mean() > 0.9
 
 
-def test_recording_changes_nothing():
-    qubo, solution = recorded()
-    silent = solve(DmmSolver(n_restarts=11, max_steps=23), qubo)
+@either_kernel
+@pytest.mark.parametrize("quench_every", [0, 4])
+def test_recording_changes_nothing(kernel, quench_every):
+    """Records fall on other steps than readings, too."""
+    qubo, solution = recorded(kernel=kernel, quench_every=quench_every)
+    silent = solve(DmmSolver(n_restarts=11, max_steps=23, kernel=kernel, quench_every=quench_every), qubo)
     assert silent.assignments.equal(solution.assignments)
 
 
-def test_restarts_not_run_have_records_of_no_duration():
-    solution = recorded(problems=(2, 3), patience=2, max_steps=101)[1]
+@either_kernel
+def test_restarts_not_run_have_records_of_no_duration(kernel):
+    solution = recorded(problems=(2, 3), patience=2, max_steps=101, kernel=kernel)[1]
     not_run = solution.status == Status.NOT_RUN
     assert not_run.any()
     assert (solution.trajectory.dwell.sum(-1) == 0).equal(not_run)
+
+
+@either_kernel
+def test_low_energy_stretch_begins_where_the_weight_first_falls_to_its_median(kernel):
+    trajectory = recorded(problems=(2, 3), patience=2, every=3, max_steps=101, kernel=kernel)[1].trajectory
+    weights, dwells = (x.flatten(0, 2).tolist() for x in (trajectory.unsatisfied_weight, trajectory.dwell))
+    found = trajectory.low_energy_dwell().flatten(0, 2).tolist()
+    shortened = 0
+    for weight, dwell, ours in zip(weights, dwells, found, strict=True):
+        median = sorted(weight)[(len(weight) - 1) // 2]
+        begin = next(at for at, x in enumerate(weight) if x <= median)
+        assert ours == [0.0] * begin + dwell[begin:]
+        shortened += begin > 0
+    assert shortened > 0
 
 
 # --- readout ----------------------------------------------------------------------------------------------
@@ -318,10 +710,10 @@ def test_time_average_weights_each_record_by_its_duration(replicas, patience):
     v, h, weight = negative.configurations
     assert v.shape == (*replicas, 7 * 17, 7)
     assert torch.cat((v, h), -1).equal(trajectory.assignments.flatten(-3, -2).double())
-    assert weight.equal(trajectory.dwell.flatten(-2))
+    assert weight.equal(trajectory.low_energy_dwell().flatten(-2))
     qubo = from_model(rbm)
     energies = qubo.energy(torch.cat((v, h), -1))
-    average = (energies * weight).sum(-1) / trajectory.dwell.sum((-1, -2))
+    average = (energies * weight).sum(-1) / trajectory.low_energy_dwell().sum((-1, -2))
     torch.testing.assert_close(rbm.mean_energy(negative.configurations).detach(), average)
 
 
@@ -346,7 +738,7 @@ def test_diagnostics_count_the_restarts():
 
     class Scripted:
         def minimise(self, qubo, *, generator):
-            solver = DmmSolver(field=field, n_restarts=7, patience=2, max_steps=2)
+            solver = DmmSolver(field=field, n_restarts=7, patience=2, max_steps=2, quench_every=0)
             return solver.minimise(field.qubo(), generator=generator)
 
     rbm = small_rbm(2, 1, replicas=(1,))

@@ -1,6 +1,8 @@
 """QUBO and weighted MAX-SAT over all states."""
 
+import dataclasses
 import itertools
+import math
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo, to_qubo
+from memcomp_lightning.qubo.maxsat import Clauses
 from memcomp_lightning.testing.conformance import small_rbm
 
 SPARSE = EdgeList(n=7, pairs=torch.tensor([[0, 1], [0, 3], [1, 6], [2, 3], [2, 6], [3, 6], [4, 6]]))
@@ -146,6 +149,228 @@ def test_field_is_the_energy_difference_of_a_flip(graph, problems):
         close(field[..., i], qubo.energy(on) - qubo.energy(off))
 
 
+# --- two encodings of a coupling --------------------------------------------------------------------------
+
+
+def test_pairs_alternate_between_two_encodings(graph):
+    """J > 0: both literals negated, or neither; J < 0: one of the two."""
+    maxsat, qubo = from_qubo(problem(graph)), problem(graph)
+    first, second = (x.expand(maxsat.weight.shape).flatten() for x in (maxsat.first, maxsat.second))
+    coupling = qubo.coupling.flatten()
+    assert (first * second == torch.where(coupling < 0, -1, 1)).all()
+    assert (second == -graph.alternating().flatten()).all()
+    assert set(second.tolist()) == {-1, 1}
+
+
+def test_encodings_of_either_kind_keep_every_energy(graph, monkeypatch):
+    """Whatever the pattern of the two encodings, also all of one kind."""
+    qubo = problem(graph, (2,))
+    for pattern in (1.0, -1.0, normal(*graph.edge_shape, seed=6).sign()):
+        way = pattern * torch.ones(graph.edge_shape)
+        monkeypatch.setattr(type(graph), "alternating", lambda self, way=way: way)
+        maxsat = from_qubo(qubo)
+        close(maxsat.energy(all_states(qubo)), qubo.energy(all_states(qubo)))
+        close(to_qubo(maxsat).linear, qubo.linear)
+        assert maxsat.weight.equal(qubo.coupling.abs())
+
+
+def test_signs_of_the_encodings_balance(graph):
+    """In a list as a whole, between two layers at every variable."""
+    signs = graph.alternating()
+    assert tuple(signs.shape) == graph.edge_shape
+    assert signs.sum().abs() <= 1
+    if isinstance(graph, Bipartite):
+        assert (graph.scatter(signs, signs).abs() <= 1).all()
+
+
+def cut_problem(n, pairs):
+    """MAX-CUT of an unweighted graph: every cut edge counts -1."""
+    pairs = torch.tensor(pairs)
+    degree = torch.bincount(pairs.flatten(), minlength=n).double()
+    weights = torch.full((len(pairs),), 2.0, dtype=torch.float64)
+    return Qubo(EdgeList(n=n, pairs=pairs), weights, -degree, torch.zeros((), dtype=torch.float64)), degree
+
+
+CUTS = {
+    "complete graph": (15, list(itertools.combinations(range(15), 2))),
+    "ring": (11, [(i, i + 1) for i in range(10)] + [(0, 10)]),
+    "star": (11, [(0, i) for i in range(1, 11)]),
+    "grid": (
+        20,
+        sorted(
+            [(5 * r + c, 5 * r + c + 1) for r in range(4) for c in range(4)]
+            + [(5 * r + c, 5 * r + c + 5) for r in range(3) for c in range(5)]
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CUTS)
+def test_units_nearly_cancel_on_max_cut(name):
+    """The clauses of a vertex weigh twice its degree; its unit clause weighs no more than half of that."""
+    qubo, degree = cut_problem(*CUTS[name])
+    unit = from_qubo(qubo).unit
+    assert (unit.abs() <= degree).all()
+    assert unit.square().mean() < 0.3 * degree.square().mean()
+    assert unit.sum().abs() <= 0.2 * degree.sum()
+
+
+# --- clauses of any length --------------------------------------------------------------------------------
+
+LITERALS = [
+    [1, -2, 3],
+    [2, -3],
+    [-4],
+    [5, 5, -1],
+    [1, -1, 2],
+    [4, -4],
+    [],
+    [3],
+    [-3],
+    [3],
+    [-3, 1, -5, 2],
+    [2, -3],
+]
+WEIGHTS = [1.0, 2.5, 0.7, 1.1, 9.0, 3.0, 0.4, 5.0, 2.0, 0.25, 1.3, 0.5]
+
+
+def clauses_by_loop(literals, weights, states):
+    """The weight of the clauses with no true literal, state by state."""
+    return torch.tensor(
+        [
+            sum(
+                w
+                for clause, w in zip(literals, weights, strict=True)
+                if not any(x[abs(q) - 1] == (q > 0) for q in clause)
+            )
+            for x in (states > 0.5).tolist()
+        ],
+        dtype=torch.float64,
+    )
+
+
+def random_clauses(n, number, seed):
+    """Clauses of 0 to 6 literals, drawn with repetition: duplicates, opposites and tautologies among them."""
+    generator = rng.stream(seed, "clauses")
+    lengths = torch.randint(7, (number,), generator=generator).tolist()
+    signs = [torch.randint(2, (length,), generator=generator) * 2 - 1 for length in lengths]
+    literals = [
+        (torch.randint(1, n + 1, (length,), generator=generator) * sign).tolist()
+        for length, sign in zip(lengths, signs, strict=True)
+    ]
+    return literals, (3 * rng.uniform((number,), generator=generator)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("n", "literals", "weights"),
+    [(5, LITERALS, WEIGHTS), *((n, *random_clauses(n, 60, seed=n)) for n in (1, 2, 5, 9))],
+    ids=["by hand", "1", "2", "5", "9"],
+)
+def test_clauses_weigh_what_was_given(n, literals, weights):
+    maxsat = WeightedMaxSat.from_clauses(n, literals, weights, offset=0.3)
+    states = binary_states(n, like=maxsat.unit)
+    close(maxsat.energy(states), clauses_by_loop(literals, weights, states) + 0.3)
+    close(maxsat.unsatisfied_weight(states) + maxsat.offset, maxsat.energy(states))
+
+
+def test_parts_of_a_problem_by_hand():
+    maxsat = WeightedMaxSat.from_clauses(5, LITERALS, WEIGHTS, offset=0.3)
+    assert maxsat.unit.tolist() == [0.0, 0.0, 3.25, -0.7, 0.0]
+    assert maxsat.offset.item() == pytest.approx(0.3 + 0.4 + 2.0)  # the empty clause; 2 of the opposite units
+    assert maxsat.graph.pairs.tolist() == [[1, 2], [0, 4], [1, 2]]  # [5, 5, -1] is [-1, 5]
+    assert maxsat.weight.tolist() == [2.5, 1.1, 0.5]
+    assert torch.stack((maxsat.first, maxsat.second), -1).tolist() == [[1, -1], [-1, 1], [1, -1]]
+    assert [block.variables.tolist() for block in maxsat.longer] == [[[0, 1, 2]], [[0, 1, 2, 4]]]
+    assert [block.polarity.tolist() for block in maxsat.longer] == [[[1, -1, 1]], [[1, 1, -1, -1]]]
+    assert [block.weight.tolist() for block in maxsat.longer] == [[1.0], [1.3]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_problem_without_clauses(dtype):
+    maxsat = WeightedMaxSat.from_clauses(3, [], [], offset=2.0, dtype=dtype)
+    assert maxsat.energy(binary_states(3, like=maxsat.unit)).tolist() == [2.0] * 8
+    assert maxsat.unit.dtype == maxsat.weight.dtype == dtype
+
+
+def test_tautologies_are_left_out():
+    maxsat = WeightedMaxSat.from_clauses(4, [[1, -1], [2, 3, -2], [1, 2, 3, 4, -3]], [1.0, 2.0, 3.0])
+    assert maxsat.graph.pairs.shape == (0, 2)
+    assert not maxsat.longer
+    assert maxsat.energy(torch.zeros(1, 4)).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((2, [[1], [2]], [1.0]), "number of weights = 1 .* expected 2, one a clause"),
+        ((2, [[1], [-2]], [1.0, -0.5]), r"weight of clause 2 = -0.5 .* expected a number >= 0"),
+        ((2, [[1], [-2]], [1.0, math.nan]), r"weight of clause 2 = nan .* expected a number >= 0"),
+        ((2, [[1, 3]], [1.0]), r"literals of clause 1 = \[1, 3\] .* integers of size 1 to n = 2"),
+        ((2, [[1], [0, 1]], [1.0, 1.0]), r"literals of clause 2 = \[0, 1\] .* integers of size 1 to n = 2"),
+    ],
+)
+def test_clauses_out_of_range_are_refused(arguments, message):
+    with pytest.raises(SettingError, match=message):
+        WeightedMaxSat.from_clauses(*arguments)
+
+
+def longer_maxsat(graph, problems=()):
+    """Random pairs and units, and clauses of three to five literals."""
+
+    def block(length, number):
+        draw = normal(number, graph.n, seed=30 + length).argsort(-1)[:, :length]
+        polarity = normal(number, length, seed=40 + length).sign()
+        return Clauses(draw, polarity, normal(*problems, number, seed=50 + length).abs())
+
+    return dataclasses.replace(random_maxsat(graph, problems), longer=(block(3, 6), block(4, 3), block(5, 2)))
+
+
+@every_batch
+@pytest.mark.parametrize("make", [random_maxsat, longer_maxsat])
+def test_field_of_maxsat_is_the_energy_difference_of_a_flip(graph, problems, make):
+    maxsat = make(graph, problems)
+    states = binary_states(graph.n, like=maxsat.unit).expand(*problems, -1, -1)
+    field = maxsat.field(states)
+    assert field.shape == states.shape
+    assert field.dtype == torch.float64
+    for i in range(graph.n):
+        on, off = states.clone(), states.clone()
+        on[..., i], off[..., i] = 1, 0
+        close(field[..., i], maxsat.energy(on) - maxsat.energy(off))
+
+
+@every_batch
+def test_longer_clauses_add_to_the_rest(graph, problems):
+    maxsat = longer_maxsat(graph, problems)
+    states = binary_states(graph.n, like=maxsat.unit).expand(*problems, -1, -1)
+    longer = sum(block.unsatisfied_weight(states) for block in maxsat.longer)
+    assert longer.shape == (*problems, 2**graph.n)
+    close(maxsat.energy(states), maxsat.without_longer().energy(states) + longer)
+    if not problems:
+        rows = [
+            ((sign * (variable + 1)).int().tolist(), weight)
+            for block in maxsat.longer
+            for variable, sign, weight in zip(block.variables, block.polarity, block.weight.tolist(), strict=True)
+        ]
+        close(longer, clauses_by_loop([row for row, _ in rows], [weight for _, weight in rows], states))
+
+
+def test_longer_clauses_are_no_qubo():
+    with pytest.raises(SettingError, match=r"longest clause = 5 .* at most 2 literals.*field=ClauseField"):
+        to_qubo(longer_maxsat(SPARSE))
+    to_qubo(longer_maxsat(SPARSE).without_longer())
+
+
+def test_energy_of_boolean_states():
+    maxsat, qubo = longer_maxsat(SPARSE), problem(SPARSE)
+    states = binary_states(7, like=maxsat.unit)
+    assert maxsat.energy(states > 0.5).equal(maxsat.energy(states))
+    assert qubo.energy(states > 0.5).equal(qubo.energy(states))
+
+
+# --- layouts and sources ----------------------------------------------------------------------------------
+
+
 def test_bipartite_and_edge_list_layouts_agree():
     qubo = problem(Bipartite(5, 3), (2,))
     edges = EdgeList(n=8, pairs=qubo.graph.edges())
@@ -186,6 +411,75 @@ def test_matrix_round_trip(problems):
     close(qubo.to_matrix(), upper)
     close(Qubo.from_matrix(qubo.to_matrix()).to_matrix(), upper)
     assert not qubo.offset.any()
+
+
+@every_batch
+def test_problem_of_a_list_of_entries_is_its_sum(problems):
+    """Duplicates, both orders of a pair, and diagonal entries add up."""
+    rows = torch.tensor([0, 3, 3, 1, 4, 0, 2, 2, 6, 3])
+    columns = torch.tensor([3, 0, 3, 5, 1, 3, 2, 2, 5, 3])
+    values, offset = normal(*problems, 10, seed=1), normal(*problems, seed=2)
+    qubo = Qubo.from_coo(7, rows, columns, values, offset)
+    assert qubo.graph.edges().tolist() == [[0, 3], [1, 4], [1, 5], [5, 6]]
+    states = all_states(qubo)
+    expected = (values.unsqueeze(-2) * states[..., rows] * states[..., columns]).sum(-1) + offset.unsqueeze(-1)
+    close(qubo.energy(states), expected)
+    order = torch.randperm(10, generator=rng.stream(0, "order"))
+    again = Qubo.from_coo(7, columns[order], rows[order], values[..., order], offset)
+    assert again.graph.edges().equal(qubo.graph.edges())
+    close(again.coupling, qubo.coupling)
+    close(again.linear, qubo.linear)
+
+
+def test_entries_that_cancel_keep_their_pair():
+    index = torch.tensor([[0, 1], [1, 0]])
+    qubo = Qubo.from_coo(3, index[0], index[1], torch.tensor([2.0, -2.0]))
+    assert qubo.energy(torch.ones(1, 3)).tolist() == [0.0]
+    assert qubo.coupling.tolist() == [0.0]
+
+
+def test_no_entries():
+    none = torch.zeros(0, dtype=torch.int64)
+    assert Qubo.from_coo(3, none, none, torch.zeros(0)).energy(torch.ones(1, 3)).tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "message"),
+    [
+        ([0, 3], [1, 1], r"rows = 'shape \(2,\), from 0 to 3' .* 2 integers, one a value, from 0 to n - 1 = 2"),
+        ([0, 1], [1, -1], r"columns = 'shape \(2,\), from -1 to 1' .*"),
+        ([0, 1, 2], [1, 1, 1], r"rows = 'shape \(3,\), .* 2 integers"),
+    ],
+)
+def test_entries_out_of_range_are_refused(rows, columns, message):
+    with pytest.raises(SettingError, match=message):
+        Qubo.from_coo(3, torch.tensor(rows), torch.tensor(columns), torch.ones(2))
+
+
+@pytest.mark.filterwarnings("ignore:Sparse CS. tensor support is in beta")
+@pytest.mark.parametrize("layout", [torch.sparse_coo, torch.sparse_csr, torch.sparse_csc], ids=str)
+def test_problem_of_a_sparse_tensor_is_that_of_the_dense_one(layout):
+    matrix = normal(7, 7, seed=1)
+    matrix[normal(7, 7, seed=2) > 0] = 0
+    offset = torch.tensor(0.5, dtype=torch.float64)
+    dense, sparse = Qubo.from_matrix(matrix, offset), Qubo.from_matrix(matrix.to_sparse(layout=layout), offset)
+    assert sparse.graph.edges().equal(dense.graph.edges())
+    assert sparse.coupling.equal(dense.coupling)
+    assert sparse.linear.equal(dense.linear)
+    assert sparse.offset.equal(dense.offset)
+
+
+def test_entries_of_an_uncoalesced_tensor_add_up():
+    index = torch.tensor([[0, 0, 1, 2], [1, 1, 0, 2]])
+    matrix = torch.sparse_coo_tensor(index, torch.tensor([1.0, 2.0, 4.0, 8.0]), (3, 3), check_invariants=True)
+    qubo = Qubo.from_matrix(matrix)
+    assert qubo.coupling.tolist() == [7.0]
+    assert qubo.linear.tolist() == [0.0, 0.0, 8.0]
+
+
+def test_several_sparse_matrices_at_once_are_refused():
+    with pytest.raises(SettingError, match=r"sparse matrix shape = \(2, 3, 3\) .* \(n, n\), one problem"):
+        Qubo.from_matrix(torch.zeros(2, 3, 3).to_sparse())
 
 
 def test_matrix_of_a_bipartite_problem_has_its_energies():

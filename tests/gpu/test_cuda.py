@@ -6,10 +6,12 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import Digits, ImageDataModule
-from memcomp_lightning.dmm import DmmSolver, Recording
+from memcomp_lightning.dmm import BondField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.models import DBN
+from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo, from_model
+from memcomp_lightning.qubo import AlternatingDescent, BruteForce, EdgeList, Qubo, WeightedMaxSat, from_model
+from memcomp_lightning.qubo.maxsat import Clauses
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
 
@@ -38,7 +40,16 @@ def test_samplers_draw_the_same_on_both_devices(sampler) -> None:
         torch.testing.assert_close(cuda, cpu)
 
 
-@pytest.mark.parametrize("solver", [AlternatingDescent(), DmmSolver(patience=7, record=Recording())])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        AlternatingDescent(),
+        DmmSolver(patience=7, max_steps=101, record=Recording()),
+        DmmSolver(patience=7, max_steps=101, quench_every=0, warm=WarmRestart()),
+        DmmSolver(field=BondField(), max_steps=101),
+    ],
+    ids=["descent", "records", "warm restarts", "bonds"],
+)
 def test_solvers_find_the_optimum_on_the_device(solver) -> None:
     matrix = torch.empty(2, 7, 7).normal_(generator=rng.stream(3, "matrix"))
     for qubo in (from_model(small_rbm(replicas=(3,)).cuda()), Qubo.from_matrix(matrix.cuda())):
@@ -46,6 +57,22 @@ def test_solvers_find_the_optimum_on_the_device(solver) -> None:
         solution = solver.minimise(qubo, generator=rng.stream(4, "solver"))
         assert solution.best.device.type == "cuda"
         torch.testing.assert_close(solution.best_energy, exact, rtol=1e-6, atol=1e-9)
+
+
+def test_clauses_of_any_length_are_solved_on_the_device() -> None:
+    cpu = WeightedMaxSat.from_clauses(
+        7,
+        [[1, 2, 3], [-1, 4, -5], [2, -3, 6, 7], [-2, -4], [5, -6], [-7], [3, 5]],
+        [1.0, 2.0, 1.5, 0.7, 0.4, 0.3, 1.0],
+    )
+    parts = {name: getattr(cpu, name).cuda() for name in ("weight", "first", "second", "unit", "offset")}
+    longer = tuple(
+        Clauses(block.variables.cuda(), block.polarity.cuda(), block.weight.cuda()) for block in cpu.longer
+    )
+    problem = WeightedMaxSat(EdgeList(n=7, pairs=cpu.graph.pairs.cuda()), **parts, longer=longer)
+    solution = DmmSolver(max_steps=101).minimise(problem, generator=rng.stream(4, "solver"))
+    exact = cpu.energy(binary_states(7, like=cpu.unit)).min()
+    torch.testing.assert_close(solution.best_energy.cpu(), exact)
 
 
 def test_training_runs_on_the_device() -> None:

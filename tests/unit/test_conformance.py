@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from memcomp_lightning.dmm import DmmSolver, Recording
+from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
@@ -19,6 +19,15 @@ SOLVERS = {
     "DMM with patience": DmmSolver(n_restarts=28, patience=11, max_steps=101),
     "DMM that records": DmmSolver(n_restarts=11, max_steps=101, record=Recording(every=7)),
     "DMM with both": DmmSolver(n_restarts=28, patience=11, max_steps=101, record=Recording(every=7)),
+    "DMM with warm restarts": DmmSolver(n_restarts=28, patience=7, max_steps=101, warm=WarmRestart()),
+    "DMM with default settings": DmmSolver(),
+    "DMM without descents": DmmSolver(n_restarts=11, max_steps=101, quench_every=0),
+    "DMM of bonds": DmmSolver(field=BondField(), n_restarts=11, max_steps=101, record=Recording(every=7)),
+    "DMM in plain torch": DmmSolver(n_restarts=11, max_steps=101, kernel="reference"),
+    "DMM of bonds in plain torch": DmmSolver(
+        field=BondField(), n_restarts=11, max_steps=101, record=Recording(every=7), kernel="reference"
+    ),
+    "DMM of another scheme": DmmSolver(integrator=Heun(), n_restarts=11, max_steps=101),
     "descent": AlternatingDescent(n_restarts=53),
     "brute force": BruteForce(),
     "brute force in chunks": BruteForce(chunk_size=13),
@@ -52,7 +61,7 @@ def test_solver_keeps_the_contract(solver):
 
 
 def test_solver_with_too_few_steps_keeps_all_but_the_optimum():
-    hasty = DmmSolver(n_restarts=2, max_steps=1)
+    hasty = DmmSolver(n_restarts=2, max_steps=1, quench_every=0)
     check_solver(hasty, finds_optimum=False)
     with pytest.raises(AssertionError, match=r"DmmSolver on .*: minimum not found"):
         check_solver(hasty)

@@ -6,13 +6,25 @@ import re
 
 import pytest
 
-from memcomp_lightning.dmm import AdaptiveEuler, ClauseField, DmmSolver, Recording
+from memcomp_lightning.dmm import (
+    AdaptiveEuler,
+    BondField,
+    ClauseField,
+    DmmSolver,
+    ExactShortTerm,
+    Heun,
+    Recording,
+    Splitting,
+    Strang,
+    WarmRestart,
+)
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
 
 COUNT = "an integer >= 1"
 POSITIVE = "a number > 0"
+SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
 REFUSED = [
     (CD, {"k": 0}, COUNT),
     (CD, {"k": 1.5}, COUNT),
@@ -32,9 +44,23 @@ REFUSED = [
     (DmmSolver, {"max_steps": 0}, COUNT),
     (DmmSolver, {"patience": 0}, COUNT),
     (DmmSolver, {"patience": 12, "n_restarts": 11}, "an integer from 1 to n_restarts = 11, or null"),
-    (AdaptiveEuler, {"max_change": 0.0}, POSITIVE),
-    (AdaptiveEuler, {"dt_min": 0.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
-    (AdaptiveEuler, {"dt_min": 3.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
+    (DmmSolver, {"quench_every": -1}, "an integer >= 0"),
+    (DmmSolver, {"quench_every": 1.5}, "an integer >= 0"),
+    (DmmSolver, {"kernel": "gpu"}, "one of 'auto', 'compiled', 'reference'"),
+    (WarmRestart, {"keep": -0.1}, "a number in [0, 1]"),
+    (WarmRestart, {"keep": 1.1}, "a number in [0, 1]"),
+    (WarmRestart, {"spread": 0.0}, "a number in (0, 2]"),
+    (WarmRestart, {"spread": 2.1}, "a number in (0, 2]"),
+    *(
+        (scheme, *refused)
+        for scheme in SCHEMES
+        for refused in (
+            ({"max_change": 0.0}, POSITIVE),
+            ({"max_change": math.nan}, POSITIVE),
+            ({"dt_min": 0.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
+            ({"dt_min": 3.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
+        )
+    ),
     (ClauseField, {"alpha": 0.0}, POSITIVE),
     (ClauseField, {"alpha": math.nan}, POSITIVE),
     (ClauseField, {"beta": -0.1}, POSITIVE),
@@ -42,10 +68,30 @@ REFUSED = [
     (ClauseField, {"unit_pull": 0.0}, POSITIVE),
     (ClauseField, {"gamma": 0.0}, "a number in (0, 1/2)"),
     (ClauseField, {"gamma": 0.5}, "a number in (0, 1/2)"),
-    (ClauseField, {"delta": 0.0, "gamma": 0.13}, "a number in (0, gamma = 0.13)"),
-    (ClauseField, {"delta": 0.13, "gamma": 0.13}, "a number in (0, gamma = 0.13)"),
+    (ClauseField, {"delta": 0.0, "gamma": 0.13}, "a number in (0, gamma = 0.13]"),
+    (ClauseField, {"delta": 0.14, "gamma": 0.13}, "a number in (0, gamma = 0.13]"),
     (ClauseField, {"zeta": -0.1}, "a number >= 0"),
-    (ClauseField, {"long_term_max": 1.0}, "a number > 1"),
+    (BondField, {"kappa": -0.1}, "a number >= 0"),
+    *((BondField, {name: 0.0}, POSITIVE) for name in ("alpha", "beta", "gamma", "delta", "zeta")),
+    (BondField, {"short_term_min": 0.0}, "a number in (0, 1)"),
+    (BondField, {"short_term_min": 1.0}, "a number in (0, 1)"),
+    (
+        BondField,
+        {"short_term_start": 0.1, "short_term_min": 0.2},
+        "a number in [short_term_min = 0.2, 1]",
+    ),
+    (BondField, {"short_term_start": 1.1, "short_term_min": 0.2}, "a number in [short_term_min = 0.2, 1]"),
+    *(
+        (field, *refused)
+        for field in (ClauseField, BondField)
+        for refused in (
+            ({"long_term_max": 0.99}, "a number >= 1"),
+            ({"noise": -0.1}, "a number >= 0"),
+            ({"noise": math.nan}, "a number >= 0"),
+            ({"spread": 0.0}, "a number in (0, 1]"),
+            ({"spread": 1.1}, "a number in (0, 1]"),
+        )
+    ),
 ]
 
 
@@ -86,8 +132,23 @@ BOUNDS = [
     (Exact, {"max_units": 20}),
     (DmmSolver, {"patience": 11, "n_restarts": 11}),
     (DmmSolver, {"max_steps": 1}),
-    (AdaptiveEuler, {"dt_min": 2.3, "dt_max": 2.3}),
+    (DmmSolver, {"quench_every": 0}),
+    (DmmSolver, {"quench_every": None}),
+    (DmmSolver, {"max_steps": None}),
+    (WarmRestart, {"keep": 0.0}),
+    (WarmRestart, {"keep": 1.0}),
+    (WarmRestart, {"spread": 2.0}),
+    *((scheme, {"dt_min": 2.3, "dt_max": 2.3}) for scheme in SCHEMES),
     (ClauseField, {"zeta": 0.0}),
+    (ClauseField, {"delta": 0.13, "gamma": 0.13}),
+    (ClauseField, {"long_term_max": 1.0}),
+    (ClauseField, {"noise": 0.0}),
+    (ClauseField, {"spread": 1.0}),
+    (BondField, {"kappa": 0.0}),
+    (BondField, {"long_term_max": 1.0}),
+    (BondField, {"noise": 0.0}),
+    (BondField, {"short_term_start": 0.2, "short_term_min": 0.2}),
+    (BondField, {"short_term_start": 1.0}),
     (PCD, {"n_chains": None}),
 ]
 
@@ -98,7 +159,19 @@ def test_setting_at_its_bound_is_accepted(kind, setting):
     assert getattr(kind(**setting), name) == value
 
 
-KINDS = [CD, PCD, Quench, Exact, BruteForce, AlternatingDescent, DmmSolver, AdaptiveEuler, ClauseField]
+KINDS = [
+    CD,
+    PCD,
+    Quench,
+    Exact,
+    BruteForce,
+    AlternatingDescent,
+    DmmSolver,
+    WarmRestart,
+    ClauseField,
+    BondField,
+    *SCHEMES,
+]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,0 +1,292 @@
+"""One step of each scheme by hand, orders of accuracy, step control."""
+
+import math
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.dmm import (
+    AdaptiveEuler,
+    BondField,
+    ClauseField,
+    DmmSolver,
+    ExactShortTerm,
+    Heun,
+    Splitting,
+    Strang,
+)
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.qubo import Qubo
+
+SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
+
+
+def normal(*shape, seed):
+    return torch.empty(shape, dtype=torch.float64).normal_(generator=rng.stream(seed, "test draws"))
+
+
+# --- one step by hand -------------------------------------------------------------------------------------
+
+
+class Toy(NamedTuple):
+    voltage: torch.Tensor
+    short_term: torch.Tensor
+    long_term: torch.Tensor
+
+
+def voltage_rate(v, s, x):
+    return 1.3 * s - 0.7 * x * v + 0.2
+
+
+def short_rate(v, s, x):
+    return 0.9 * (s + 0.5) * (v - 0.1)
+
+
+def long_rate(v, s, x):
+    return 2.0 * v * v - 0.6 * x + 0.3 * s
+
+
+class ToyField:
+    """One voltage, two memories, all of which feel each other; ``machine`` is the stability."""
+
+    def stability(self, machine):
+        return machine
+
+    def derivative(self, machine, state):
+        return Toy(voltage_rate(*state), short_rate(*state), long_rate(*state))
+
+    def short_term_after(self, machine, state, dt):
+        growth = (0.9 * (state.voltage - 0.1) * dt.unsqueeze(-1)).exp()
+        return {"short_term": (state.short_term + 0.5) * growth - 0.5}
+
+    def bound(self, machine, state):
+        return Toy(state.voltage.clamp(-1, 1), state.short_term.clamp(0, 1), state.long_term.clamp(1, 3))
+
+
+def clip(x, low, high):
+    return min(max(x, low), high)
+
+
+def bounded(v, s, x):
+    return clip(v, -1, 1), clip(s, 0, 1), clip(x, 1, 3)
+
+
+def euler(v, s, x, dt):
+    state = (v, s, x)
+    return bounded(v + dt * voltage_rate(*state), s + dt * short_rate(*state), x + dt * long_rate(*state))
+
+
+def splitting(v, s, x, dt):
+    v = clip(v + dt * voltage_rate(v, s, x), -1, 1)
+    return bounded(v, s + dt * short_rate(v, s, x), x + dt * long_rate(v, s, x))
+
+
+def exact_short_term(v, s, x, dt):
+    v = clip(v + dt * voltage_rate(v, s, x), -1, 1)
+    return bounded(v, (s + 0.5) * math.exp(0.9 * (v - 0.1) * dt) - 0.5, x + dt * long_rate(v, s, x))
+
+
+def strang(v, s, x, dt):
+    _, s, x = bounded(v, s + dt / 2 * short_rate(v, s, x), x + dt / 2 * long_rate(v, s, x))
+    v = clip(v + dt * voltage_rate(v, s, x), -1, 1)
+    return bounded(v, s + dt / 2 * short_rate(v, s, x), x + dt / 2 * long_rate(v, s, x))
+
+
+def heun(v, s, x, dt):
+    here, there = (v, s, x), euler(v, s, x, dt)
+    mean = [(rate(*here) + rate(*there)) / 2 for rate in (voltage_rate, short_rate, long_rate)]
+    return bounded(*(a + dt * b for a, b in zip(here, mean, strict=True)))
+
+
+BY_HAND = {
+    AdaptiveEuler: euler,
+    Splitting: splitting,
+    ExactShortTerm: exact_short_term,
+    Strang: strang,
+    Heun: heun,
+}
+STATES = [
+    (0.2, 0.7, 1.9),  # inside
+    (-0.6, 0.4, 2.9),  # the long-term memory is decaying
+    (0.9, 0.95, 1.1),  # reaches the upper bounds
+    (-0.97, 0.02, 1.0),  # at the lower bounds
+]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_step_by_hand(scheme):
+    control = {"max_change": 0.31, "dt_min": 0.2, "dt_max": 0.38}
+    state = Toy(*torch.tensor(STATES, dtype=torch.float64).unsqueeze(-1).unbind(1))
+    after, dt = scheme(**control).step(ToyField(), torch.ones(1, dtype=torch.float64), state)
+    sizes = [clip(0.31 / abs(voltage_rate(*row)), control["dt_min"], control["dt_max"]) for row in STATES]
+    assert set(sizes) > {0.2, 0.38}
+    torch.testing.assert_close(dt, torch.tensor(sizes, dtype=torch.float64))
+    expected = [BY_HAND[scheme](*row, size) for row, size in zip(STATES, sizes, strict=True)]
+    found = torch.cat(after, dim=-1)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64), rtol=1e-13, atol=1e-13)
+    assert (found == 1).any()
+
+
+def test_schemes_by_hand_differ():
+    results = {BY_HAND[scheme](*STATES[0], 0.3) for scheme in SCHEMES}
+    assert len(results) == len(SCHEMES)
+
+
+# --- orders of accuracy -----------------------------------------------------------------------------------
+
+
+def ends(scheme, field, machine, state, duration, numbers):
+    """The states after ``duration`` in each number of steps of equal size."""
+    results = []
+    for n in numbers:
+        stepper, now = scheme(max_change=1e9, dt_min=duration / n, dt_max=duration / n), state
+        for _ in range(n):
+            now, dt = stepper.step(field, machine, now)
+            assert (dt == duration / n).all()
+        results.append(torch.cat([x.flatten() for x in now]))
+    return results
+
+
+def order(scheme, field, machine, state, duration, n=16):
+    """``log2`` of the ratio of the changes when the steps are halved twice."""
+    coarse, middle, fine = ends(scheme, field, machine, state, duration, (n, 2 * n, 4 * n))
+    return math.log2((coarse - middle).norm() / (middle - fine).norm())
+
+
+def smooth_stretch():
+    """A machine of bonds on a stretch of its way that meets no bound: see the test beneath."""
+    field = BondField(alpha=0.3, beta=0.5, gamma=2.5, kappa=0.3, delta=4.0, zeta=0.3, long_term_max=9.0)
+    machine = field.build(Qubo.from_matrix(normal(7, 7, seed=1)))
+    state = field.init(machine, 0.5 * normal(3, 7, seed=2).tanh())
+    half = {key: torch.full_like(getattr(state, key), 0.4) for key in ("short_term", "field_short_term")}
+    more = {key: torch.full_like(getattr(state, key), 1.5) for key in ("long_term", "field_long_term")}
+    return field, machine, state._replace(**half, **more)
+
+
+def test_smooth_stretch_meets_no_bound():
+    field, machine, state = smooth_stretch()
+    integrator = AdaptiveEuler(max_change=1e9, dt_min=0.01, dt_max=0.01)
+    start = state
+    for _ in range(20):
+        rate = field.derivative(machine, state)
+        moved = type(state)(*(x + 0.01 * dx for x, dx in zip(state, rate, strict=True)))
+        state, _ = integrator.step(field, machine, state)
+        for a, b in zip(state, moved, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
+    assert all((a - b).abs().max() > 0.05 for a, b in zip(start, state, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("scheme", "expected"), [(AdaptiveEuler, 1), (Splitting, 1), (ExactShortTerm, 1), (Strang, 1), (Heun, 2)]
+)
+def test_order_of_accuracy(scheme, expected):
+    """Strang's splitting is of order 1 here, as its halves are steps of Euler's method."""
+    assert order(scheme, *smooth_stretch(), duration=0.2) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_all_schemes_have_one_limit(scheme):
+    field, machine, state = smooth_stretch()
+    (reference,) = ends(Heun, field, machine, state, 0.2, (256,))
+    errors = [(end - reference).norm().item() for end in ends(scheme, field, machine, state, 0.2, (16, 64, 256))]
+    assert errors[0] > 2 * errors[1] > 4 * errors[2] or errors[2] < 1e-6
+    assert errors[2] < 3e-3
+
+
+class Pendulum(NamedTuple):
+    voltage: torch.Tensor
+    long_term: torch.Tensor
+
+
+class PendulumField:
+    """The voltage feels the memory alone and the memory the voltage alone: both halves of a step are exact."""
+
+    def stability(self, machine):
+        return torch.ones(1, dtype=torch.float64)
+
+    def derivative(self, machine, state):
+        return Pendulum(state.long_term.sin(), -state.voltage.sin())
+
+    def bound(self, machine, state):
+        return state
+
+
+@pytest.mark.parametrize(("scheme", "expected"), [(AdaptiveEuler, 1), (Splitting, 1), (Strang, 2), (Heun, 2)])
+def test_order_where_both_halves_of_a_splitting_are_exact(scheme, expected):
+    state = Pendulum(*torch.tensor([[[0.3], [0.8]], [[1.1], [-0.4]]], dtype=torch.float64))
+    assert order(scheme, PendulumField(), None, state, duration=1.0) == pytest.approx(expected, abs=0.1)
+
+
+def test_exact_short_term_has_no_error_where_the_short_term_memory_is_alone():
+    """Frozen voltages: many small steps and a single large one end at the same short-term memories."""
+    field = ClauseField(alpha=1e-30, beta=3.0, gamma=0.25, delta=0.05, epsilon=0.1, unit_pull=1e-30)
+    machine = field.build(Qubo.from_matrix(normal(7, 7, seed=1)))
+    machine = machine._replace(weight=0 * machine.weight)
+    state = field.init(machine, normal(3, 7, seed=2).tanh())
+    one, many = ends(ExactShortTerm, field, machine, state, 0.8, (1, 100))
+    torch.testing.assert_close(one, many, rtol=1e-10, atol=1e-10)
+    euler, _ = ends(Splitting, field, machine, state, 0.8, (1, 100))
+    assert (euler - many).abs().max() > 0.1
+
+
+# --- step control -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_step_sizes(scheme):
+    integrator = scheme(max_change=0.5, dt_min=0.1, dt_max=2.0)
+    rate = torch.tensor([[[0.0, 0.0], [0.3, -1.0], [-9.0, 1.0]], [[0.1, 0.2], [2.5, 0.0], [1e30, 1.0]]])
+    full = integrator.step_size(rate, torch.ones(2, 1))
+    torch.testing.assert_close(full, torch.tensor([[2.0, 0.5, 0.1], [2.0, 0.2, 0.1]]))
+    careful = integrator.step_size(rate, torch.tensor([[1.0], [0.6]]))
+    torch.testing.assert_close(careful, torch.tensor([[2.0, 0.5, 0.1], [1.5, 0.12, 0.1]]))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_steps_follow_the_stability_of_each_problem(scheme):
+    """All voltages of the first problem pull alike, those of the second do not."""
+    alike = torch.ones(13, 13, dtype=torch.float64).triu(1)
+    qubo = Qubo.from_matrix(torch.stack((alike, alike * normal(13, 13, seed=1))))
+    field = ClauseField()
+    machine = field.build(qubo)
+    stability = field.stability(machine)
+    assert stability[0, 0] < 0.7
+    assert stability[1, 0] == 1
+    state = field.init(machine, normal(2, 5, 13, seed=2).tanh())
+    _, dt = scheme(max_change=0.3, dt_min=1e-9, dt_max=1e9).step(field, machine, state)
+    fastest = field.derivative(machine, state).voltage.abs().amax(-1)
+    torch.testing.assert_close(dt, stability * 0.3 / fastest)
+
+
+# --- refusals ---------------------------------------------------------------------------------------------
+
+
+def test_exact_short_term_refuses_a_field_without_the_solution():
+    state = Pendulum(torch.zeros(1, 1), torch.ones(1, 1))
+    with pytest.raises(
+        SettingError, match=r"a scheme that PendulumField supports.*short_term_after.* use Splitting"
+    ):
+        ExactShortTerm().step(PendulumField(), None, state)
+
+
+def test_state_that_is_no_named_tuple_is_refused():
+    class Loose:
+        voltage = torch.zeros(1, 1)
+
+    class LooseField(PendulumField):
+        def derivative(self, machine, state):
+            return Loose()
+
+    with pytest.raises(TypeError, match="must be a NamedTuple of tensors, got Loose"):
+        AdaptiveEuler().step(LooseField(), None, Loose())
+
+
+@pytest.mark.parametrize("field", [ClauseField(), BondField()], ids=lambda field: type(field).__name__)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_every_scheme_solves_a_small_problem(scheme, field):
+    qubo = Qubo.from_matrix(torch.tensor([[1.0, -3.0, 0.0], [0.0, 1.0, 2.0], [0.0, 0.0, -0.5]]))
+    settings = {name: getattr(field.integrator, name) for name in ("max_change", "dt_min", "dt_max")}
+    solver = DmmSolver(field=field, integrator=scheme(**settings), n_restarts=5, max_steps=50, quench_every=None)
+    assert solver.minimise(qubo, generator=rng.stream(0, "solver")).best_energy.item() == -1

@@ -1,0 +1,513 @@
+"""The compiled kernels against the readable one, step by step and after many steps."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
+from memcomp_lightning.dmm.kernels import cpu, lanes, reference
+from memcomp_lightning.dmm.kernels.run import Start
+from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, Status, WeightedMaxSat, from_qubo
+from memcomp_lightning.qubo.maxsat import Clauses
+
+# Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
+SLOW = Splitting(max_change=0.6, dt_min=0.01, dt_max=0.4)
+FIELDS = {
+    "clauses": ClauseField(
+        alpha=2.0,
+        beta=1.5,
+        gamma=0.25,
+        delta=0.1,
+        epsilon=0.1,
+        zeta=0.3,
+        long_term_max=2.0,
+        unit_pull=0.8,
+        noise=0.0,
+        spread=0.8,
+        integrator=SLOW,
+    ),
+    "bonds": BondField(
+        alpha=1.5, beta=2.0, gamma=0.6, kappa=1.3, delta=0.5, zeta=1.5, noise=0.0, spread=0.9, integrator=SLOW
+    ),
+    "bonds with moving Y": BondField(
+        gamma=2.5, delta=4.0, zeta=1.0, long_term_max=1.8, noise=0.0, spread=0.9, integrator=SLOW
+    ),
+}
+RESTARTS = [1, 16, 17, 28, 33]
+
+
+def normal(*shape, seed=0):
+    return torch.empty(shape).normal_(generator=rng.stream(seed, "test draws"))
+
+
+def bipartite(n_first, n_second, n_problems, seed=0):
+    graph = Bipartite(n_first, n_second)
+    shape = (n_problems, *graph.edge_shape)
+    coupling, linear = normal(*shape, seed=seed), normal(n_problems, graph.n, seed=seed + 1)
+    coupling[normal(*graph.edge_shape, seed=seed + 2).expand(shape) > 1.2] = 0
+    return Qubo(graph, coupling, linear, normal(n_problems, seed=seed + 3))
+
+
+def listed(n, n_problems, seed=0):
+    matrix = normal(n_problems, n, n, seed=seed)
+    return Qubo.from_matrix(matrix * (normal(n, n, seed=seed + 1) > 0.2), normal(n_problems, seed=seed + 2))
+
+
+def maxsat(n, n_problems, lengths=((3, 40), (4, 9), (5, 4)), n_pairs=20, seed=0):
+    """Pairs, units and longer clauses, padded to five literals."""
+
+    def literals(number, length, seed):
+        draw = rng.uniform((number, n), generator=rng.stream(seed, "test draws"))
+        return draw.argsort(-1)[:, :length], normal(number, length, seed=seed + 1).sign()
+
+    pairs, polarity = literals(n_pairs, 2, seed)
+    return WeightedMaxSat(
+        graph=EdgeList(n=n, pairs=pairs),
+        weight=normal(n_problems, n_pairs, seed=seed + 2).abs(),
+        first=polarity[:, 0],
+        second=polarity[:, 1],
+        unit=0.5 * normal(n_problems, n, seed=seed + 3),
+        offset=normal(n_problems, seed=seed + 4),
+        longer=tuple(
+            Clauses(*literals(number, length, seed + 10 * length), normal(n_problems, number, seed=length).abs())
+            for length, number in lengths
+        ),
+    )
+
+
+PROBLEMS = {
+    "bipartite 17 + 11": bipartite(17, 11, 2),
+    "bipartite 11 + 17": bipartite(11, 17, 2),
+    "one bipartite": bipartite(9, 7, 1),
+    "listed": listed(13, 3),
+    "one listed": listed(13, 1),
+}
+CLAUSES = {
+    "pairs and longer clauses": maxsat(17, 2),
+    "3-SAT": maxsat(17, 1, lengths=((3, 70),), n_pairs=0),
+    "pairs": maxsat(17, 2, lengths=(), n_pairs=40),
+}
+
+
+EVERY = PROBLEMS | CLAUSES
+
+
+def cases(*keys):
+    """Names of fields with names of problems: bonds have two ends."""
+    return pytest.mark.parametrize(
+        ("key", "name"), [(key, name) for key in keys for name in EVERY if key == "clauses" or name in PROBLEMS]
+    )
+
+
+def start(problem, n_restarts, field, long_term_max=None, seed=0):
+    """Voltages, and seeds of the noise; with memories at rest or kept ones."""
+    generator, shape = rng.stream(seed, "start"), (problem.offset.shape[0], n_restarts)
+    draw = rng.uniform((*shape, problem.n), generator=generator)
+    seeds = torch.randint(2**32, shape, generator=generator)
+    kept = ()
+    if long_term_max is not None:
+        longer = sum(block.weight.shape[-1] for block in getattr(problem, "longer", ()))
+        sizes = [problem.graph.edge_shape, (problem.n,), (longer,)]
+        if isinstance(problem.graph, Bipartite):
+            sizes.pop()
+        kept = tuple((long_term_max - 1) * rng.uniform((*shape, *size), generator=generator) for size in sizes)
+    return Start(field.spread * (2 * draw - 1), kept, seeds)
+
+
+def both(field, problem, begin, n_steps=8, quench_every=0, recording=Recording(every=1)):  # noqa: B008
+    settings = {"n_steps": n_steps, "quench_every": quench_every, "recording": recording}
+    return tuple(kernel.run(field, field.integrator, problem, begin, **settings) for kernel in (reference, cpu))
+
+
+def alike(problem, ours, theirs, tolerance=1e-3):
+    torch.testing.assert_close(theirs.voltage, ours.voltage, rtol=0, atol=tolerance)
+    for a, b in zip(ours.kept, theirs.kept, strict=False):
+        torch.testing.assert_close(b, a, rtol=0, atol=tolerance)
+    assert theirs.best.equal(ours.best)
+    assert (theirs.visited is None) == (ours.visited is None)
+    if ours.visited is not None:
+        torch.testing.assert_close(theirs.visited.time, ours.visited.time, rtol=1e-3, atol=0)
+        assert theirs.visited.states.equal(ours.visited.states)
+
+
+# --- the same steps ---------------------------------------------------------------------------------------
+
+
+@cases(*FIELDS)
+def test_same_trajectories(key, name):
+    field, problem = FIELDS[key], EVERY[name]
+    for n_restarts in RESTARTS:
+        ours, theirs = both(field, problem, start(problem, n_restarts, field))
+        alike(problem, ours, theirs)
+        assert not ours.visited.states[:, :, 0].equal(ours.visited.states[:, :, -1])
+
+
+@cases(*FIELDS)
+def test_same_noise(key, name):
+    field, problem = dataclasses.replace(FIELDS[key], noise=0.4), EVERY[name]
+    begin = start(problem, 17, field)
+    ours, theirs = both(field, problem, begin, n_steps=5)
+    alike(problem, ours, theirs)
+    silent, _ = both(FIELDS[key], problem, begin, n_steps=5)
+    assert (silent.voltage - ours.voltage).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("quench_every", [1, 3])
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("key", FIELDS)
+def test_same_quenches(key, name, quench_every):
+    field, problem = FIELDS[key], PROBLEMS[name]
+    ours, theirs = both(field, problem, start(problem, 17, field), quench_every=quench_every)
+    alike(problem, ours, theirs)
+    plain, _ = both(field, problem, start(problem, 17, field))
+    assert (problem.energy(ours.best) < problem.energy(plain.best) - 1e-3).any()
+
+
+@pytest.mark.parametrize("recording", [None, Recording(every=3), Recording(every=8), Recording(every=9)], ids=str)
+@pytest.mark.parametrize("name", ["bipartite 17 + 11", "listed"])
+@pytest.mark.parametrize("key", ["clauses", "bonds"])
+def test_same_records(key, name, recording):
+    field, problem = FIELDS[key], PROBLEMS[name]
+    ours, theirs = both(field, problem, start(problem, 17, field), recording=recording)
+    if recording == Recording(every=9):
+        assert theirs.visited.states.shape == (problem.offset.shape[0], 17, 0, problem.n)
+        return
+    alike(problem, ours, theirs)
+    _, silent = both(field, problem, start(problem, 17, field), recording=None)
+    assert silent.voltage.equal(theirs.voltage)
+
+
+@cases("clauses", "bonds with moving Y")
+def test_same_ways_on_from_kept_memories(key, name):
+    field, problem = FIELDS[key], EVERY[name]
+    begin = start(problem, 17, field, field.long_term_max)
+    ours, theirs = both(field, problem, begin, n_steps=5)
+    alike(problem, ours, theirs)
+    forgot, _ = both(field, problem, begin._replace(kept=()), n_steps=5)
+    assert (forgot.voltage - ours.voltage).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("name", ["bipartite 17 + 11", "listed", "pairs and longer clauses"])
+def test_large_steps_of_the_memories_end_at_their_bounds(name):
+    """alpha delta dt > 1: an unbounded Euler step of a decaying memory would pass its lower bound."""
+    field = dataclasses.replace(
+        FIELDS["clauses"],
+        alpha=30.0,
+        gamma=0.3,
+        delta=0.2,
+        long_term_max=5.0,
+        integrator=Splitting(max_change=1.0, dt_min=0.5, dt_max=0.5),
+    )
+    problem = EVERY[name]
+    ours, theirs = both(field, problem, start(problem, 17, field, 5.0), n_steps=3)
+    for memory in theirs.kept:
+        assert (memory >= 0).all()
+        assert (memory <= 4).all()
+    alike(problem, ours, theirs)
+
+
+@pytest.mark.parametrize("field", [ClauseField(), BondField(noise=0.0)], ids=["clauses", "bonds"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_same_first_steps_with_the_default_constants(name, field):
+    problem = PROBLEMS[name]
+    ours, theirs = both(field, problem, start(problem, 17, field), n_steps=2, quench_every=1)
+    torch.testing.assert_close(theirs.voltage, ours.voltage, rtol=0, atol=1e-3)
+    assert theirs.visited.states.equal(ours.visited.states)
+
+
+@pytest.mark.parametrize("key", FIELDS)
+def test_solver_gives_the_same_answer_with_either_kernel(key):
+    """Also with groups of restarts that go on from the ends of earlier ones, problem by problem."""
+    for problem in (PROBLEMS["bipartite 17 + 11"], PROBLEMS["listed"]):
+        compiled, plain = (
+            DmmSolver(
+                field=FIELDS[key], n_restarts=12, patience=4, max_steps=5, warm=WarmRestart(), kernel=kernel
+            ).minimise(problem, generator=rng.stream(0, "solver"))
+            for kernel in ("compiled", "reference")
+        )
+        assert compiled.assignments.equal(plain.assignments)
+        assert compiled.energies.equal(plain.energies)
+        assert (compiled.status == Status.NOT_RUN).equal(plain.status == Status.NOT_RUN)
+
+
+# --- after many steps -------------------------------------------------------------------------------------
+
+
+def same_success(ours, theirs):
+    """Means of the energies found, problem by problem, within five standard errors of their difference."""
+    error = ((ours.var(-1) + theirs.var(-1)) / ours.shape[-1]).sqrt()
+    assert (error > 0).all()
+    return bool(((ours.mean(-1) - theirs.mean(-1)).abs() < 5 * error).all())
+
+
+@pytest.mark.parametrize(
+    ("field", "problem"),
+    [
+        (ClauseField(), bipartite(37, 41, 3, seed=50)),
+        (BondField(), bipartite(37, 41, 3, seed=50)),
+        (ClauseField(), listed(71, 3, seed=60)),
+        (BondField(), listed(71, 3, seed=60)),
+        (ClauseField(), maxsat(40, 2, lengths=((3, 160),), n_pairs=0)),
+    ],
+    ids=["clauses, bipartite", "bonds, bipartite", "clauses, listed", "bonds, listed", "clauses, 3-SAT"],
+)
+def test_same_success_after_many_steps(field, problem):
+    begin = start(problem, 64, field)
+    ours, theirs = (problem.energy(run.best) for run in both(field, problem, begin, n_steps=40, recording=None))
+    assert same_success(ours, theirs)
+    stopped_early = cpu.run(field, field.integrator, problem, begin, n_steps=8, quench_every=0, recording=None)
+    assert not same_success(ours, problem.energy(stopped_early.best))
+
+
+# --- layouts, batches, lanes and threads ------------------------------------------------------------------
+
+
+def as_list(qubo):
+    """The same problem with its pairs listed."""
+    graph = EdgeList(n=qubo.n, pairs=qubo.graph.edges())
+    return Qubo(graph, qubo.coupling.flatten(-2), qubo.linear, qubo.offset)
+
+
+def as_listed_maxsat(qubo):
+    """The MAX-SAT form of a bipartite problem with its pairs listed: the encodings of two layouts differ."""
+    clauses = from_qubo(qubo)
+    flat = {
+        key: getattr(clauses, key).expand(clauses.weight.shape).flatten(-2)
+        for key in ("weight", "first", "second")
+    }
+    return dataclasses.replace(clauses, graph=EdgeList(n=qubo.n, pairs=qubo.graph.edges()), **flat)
+
+
+@pytest.mark.parametrize("name", ["bipartite 17 + 11", "bipartite 11 + 17", "one bipartite"])
+@pytest.mark.parametrize("key", FIELDS)
+def test_matrix_and_list_of_the_same_problem_have_the_same_trajectory(key, name):
+    """These are two kernels: vectors along the rows of the matrix, vectors along the restarts."""
+    field, problem = FIELDS[key], PROBLEMS[name]
+    other = as_listed_maxsat(problem) if isinstance(field, ClauseField) else as_list(problem)
+    begin = start(problem, 28, field)
+    settings = {"n_steps": 8, "quench_every": 0, "recording": Recording(every=1)}
+    ours = cpu.run(field, SLOW, problem, begin, **settings)
+    theirs = cpu.run(field, SLOW, other, begin, **settings)
+    alike(problem, ours._replace(kept=()), theirs)
+
+
+def bits(run):
+    return [run.best, run.found_at, run.voltage, *run.kept, *(run.visited or ())]
+
+
+def compiled(problem, begin, field, n_steps=150):
+    settings = {"n_steps": n_steps, "quench_every": 2, "recording": Recording(every=50)}
+    return bits(cpu.run(field, field.integrator, problem, begin, **settings))
+
+
+@pytest.fixture
+def two_threads():
+    """A function that runs another one on two threads."""
+
+    def run(function, *arguments):
+        torch.set_num_threads(2)
+        try:
+            return function(*arguments)
+        finally:
+            torch.set_num_threads(1)
+
+    yield run
+    torch.set_num_threads(1)
+
+
+EVERY_LAYOUT = ["bipartite 17 + 11", "listed", "pairs and longer clauses"]
+
+
+@pytest.mark.parametrize("name", EVERY_LAYOUT)
+@pytest.mark.parametrize("field", [ClauseField(noise=0.1), BondField()], ids=["clauses", "bonds"])
+def test_number_of_threads_does_not_change_a_bit(field, name, two_threads):
+    problem = EVERY[name]
+    if name in CLAUSES and isinstance(field, BondField):
+        problem = problem.without_longer()
+    begin = start(problem, 70, field)
+    one, two = compiled(problem, begin, field), two_threads(compiled, problem, begin, field)
+    assert all(a.equal(b) for a, b in zip(one, two, strict=True))
+
+
+@pytest.mark.parametrize("name", EVERY_LAYOUT)
+@pytest.mark.parametrize("field", [ClauseField(noise=0.1), BondField()], ids=["clauses", "bonds"])
+def test_other_restarts_do_not_change_a_bit(field, name):
+    """Idle lanes, too: 33 restarts take two blocks, five take one."""
+    problem = EVERY[name]
+    if name in CLAUSES and isinstance(field, BondField):
+        problem = problem.without_longer()
+    begin = start(problem, 33, field)
+    every = cpu.run(field, field.integrator, problem, begin, n_steps=90, quench_every=0, recording=None)
+    few = begin._replace(voltage=begin.voltage[:, 28:], seed=begin.seed[:, 28:])
+    some = cpu.run(field, field.integrator, problem, few, n_steps=90, quench_every=0, recording=None)
+    assert some.voltage.equal(every.voltage[:, 28:])
+    assert all(a.equal(b[:, 28:]) for a, b in zip(some.kept, every.kept, strict=True))
+
+
+@pytest.mark.parametrize("key", ["clauses", "bonds"])
+@pytest.mark.parametrize("name", ["bipartite", "listed"])
+def test_other_problems_do_not_matter(name, key):
+    field = FIELDS[key]
+    problem = bipartite(17, 11, 5, seed=20) if name == "bipartite" else listed(13, 5, seed=30)
+    begin = start(problem, 17, field)
+    together = compiled(problem, begin, field, n_steps=8)
+    for at in range(5):
+        one = slice(at, at + 1)
+        part = Qubo(problem.graph, problem.coupling[one], problem.linear[one], problem.offset[one])
+        alone = compiled(part, Start(begin.voltage[one], (), begin.seed[one]), field, n_steps=8)
+        for a, b in zip(together, alone, strict=True):
+            torch.testing.assert_close(a[one], b, rtol=1e-4, atol=1e-4)
+
+
+# --- digital states ---------------------------------------------------------------------------------------
+
+
+def after_flips(problem, x, energies):
+    """Energies after the flip of each variable, ``(n_problems, n_restarts, n)``."""
+    change = 1 - 2 * x.double()
+    return energies.unsqueeze(-1) + change * problem.field(x.to(torch.get_default_dtype())).double()
+
+
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("field", [ClauseField(), BondField()], ids=["clauses", "bonds"])
+def test_best_is_the_lowest_of_all_states_and_cannot_be_improved_by_a_flip(field, name):
+    problem = EVERY[name]
+    if name in CLAUSES and isinstance(field, BondField):
+        problem = problem.without_longer()
+    solver = DmmSolver(
+        field=field, n_restarts=33, max_steps=150, quench_every=1, record=Recording(every=1), kernel="compiled"
+    )
+    solution = solver.minimise(problem, generator=rng.stream(0, "solver"))
+    energies = problem.energy(solution.assignments)
+    assert solution.energies.equal(energies)
+    visited = solution.trajectory.assignments
+    lowest = torch.stack([problem.energy(state) for state in visited.unbind(2)], dim=-1).amin(-1)
+    assert (energies <= lowest + 1e-5).all()
+    assert (after_flips(problem, solution.assignments, energies) >= energies.unsqueeze(-1) - 1e-5).all()
+    first = visited[:, :, 0]
+    energies = problem.energy(first)
+    assert (after_flips(problem, first, energies) < energies.unsqueeze(-1) - 1e-3).any()
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_best_without_quenches_is_the_state_at_the_step_it_was_found_at(name):
+    problem, field = EVERY[name], ClauseField()
+    begin = start(problem, 17, field)
+    settings = {"n_steps": 100, "quench_every": 0, "recording": Recording(every=1)}
+    run = cpu.run(field, field.integrator, problem, begin, **settings)
+    states = torch.cat(((begin.voltage > 0).unsqueeze(2), run.visited.states), dim=2)
+    assert states.take_along_dim(run.found_at[..., None, None], dim=2).squeeze(2).equal(run.best)
+    energies = torch.stack([problem.energy(state) for state in states.unbind(2)], dim=-1)
+    torch.testing.assert_close(problem.energy(run.best), energies.amin(-1), rtol=1e-6, atol=1e-6)
+    assert (run.found_at > 0).any()
+
+
+@pytest.mark.parametrize("quench_every", [0, 1])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_best_is_said_to_come_when_it_was_first_met(name, quench_every):
+    """Not when it was met again with an energy that rounding made lower."""
+    problem, field = PROBLEMS[name], FIELDS["bonds"]
+    ours, theirs = both(field, problem, start(problem, 33, field), n_steps=20, quench_every=quench_every)
+    same = (ours.best == theirs.best).all(-1)
+    assert same.float().mean() > 0.8
+    assert theirs.found_at[same].equal(ours.found_at[same])
+
+
+@pytest.mark.parametrize("name", ["listed", *CLAUSES])
+def test_local_fields_and_energies_follow_the_flips(name):
+    problem = EVERY[name]
+    field = ClauseField()
+    n_problems, n, n_lanes = problem.offset.shape[0], problem.n, 16
+    sparse = cpu._sparse(field.build(problem), problem, n_problems)
+    generator = rng.stream(5, "flips")
+    x0 = (rng.uniform((n, n_lanes), generator=generator) < 0.5).float()
+    for p in range(n_problems):
+        offsets, neighbours, edge, coupling, in_clause, clause_of, weight = sparse.digital
+        parts = (offsets, neighbours, edge, coupling[p], in_clause, clause_of)
+        digital = (*parts, sparse.variables, sparse.longer_polarity, weight[p])
+        x, local, energy = x0.numpy().copy(), np.empty((n, n_lanes), np.float32), np.zeros(n_lanes)
+        true = np.zeros((sparse.longer_weight.shape[1], n_lanes), np.int32)
+        lanes.local_fields(digital, sparse.linear[p], sparse.pairs, x, local, true, energy)
+        first = energy.copy()
+        unit = scale_of(problem, p) / scale_of_arrays(sparse, p)
+
+        def check(x=x, local=local, energy=energy, first=first, unit=unit, p=p):
+            states = torch.zeros(n_problems, n_lanes, n)
+            states[p] = torch.from_numpy(x.T.copy())
+            begin = torch.zeros(n_problems, n_lanes, n)
+            begin[p] = x0.T
+            expected = problem.field(states)[p].T.double()
+            torch.testing.assert_close(torch.from_numpy(local).double() * unit, expected, rtol=1e-4, atol=1e-5)
+            change = (problem.energy(states) - problem.energy(begin))[p]
+            torch.testing.assert_close(torch.from_numpy(energy - first) * unit, change, rtol=1e-4, atol=1e-5)
+
+        check()
+        for _ in range(60):
+            i, k = (int(torch.randint(size, (), generator=generator)) for size in (n, n_lanes))
+            before = x.copy()
+            energy[k] += lanes.flip(digital, x, local, true, i, k)
+            assert np.argwhere(x != before).tolist() == [[i, k]]
+            check()
+        fresh, fresh_true, fresh_energy = np.empty_like(local), np.empty_like(true), np.zeros(n_lanes)
+        lanes.local_fields(digital, sparse.linear[p], sparse.pairs, x, fresh, fresh_true, fresh_energy)
+        np.testing.assert_allclose(fresh, local, atol=1e-5)
+        np.testing.assert_allclose(fresh_energy, energy, atol=1e-5)
+        np.testing.assert_array_equal(fresh_true, true)
+
+
+def scale_of(problem, p):
+    """A number that the kernel divides by its scale: the sum of all parts of the energy."""
+    if isinstance(problem, Qubo):
+        return float(problem.coupling[p].abs().sum())
+    return float(problem.weight[p].sum() + sum(block.weight[p].sum() for block in problem.longer))
+
+
+def scale_of_arrays(sparse, p):
+    return float(np.abs(sparse.digital[3][p]).sum() + sparse.digital[6][p].sum())
+
+
+def test_quench_of_the_readable_kernel_ends_where_no_flip_helps():
+    for problem in (*PROBLEMS.values(), *CLAUSES.values()):
+        x = rng.uniform((problem.offset.shape[0], 23, problem.n), generator=rng.stream(0, "states")) < 0.5
+        down = reference.quench(problem, x)
+        energies = problem.energy(down)
+        assert (energies <= problem.energy(x)).all()
+        assert (after_flips(problem, down, energies) >= energies.unsqueeze(-1) - 1e-5).all()
+
+
+# --- noise ------------------------------------------------------------------------------------------------
+
+
+def test_noise_is_uniform_and_a_function_of_seed_and_counter():
+    seed, counter = torch.tensor([[0], [1], [2**32 - 1]]), torch.arange(20000)
+    draw = reference.uniform(seed, counter)
+    assert draw.shape == (3, 20000)
+    assert draw.min() >= -1
+    assert draw.max() < 1
+    assert (draw.mean(-1).abs() < 5 / (3 * 20000) ** 0.5).all()
+    assert ((draw.square().mean(-1) - 1 / 3).abs() < 0.02).all()
+    correlation = (draw[:, 1:] * draw[:, :-1]).mean(-1) * 3
+    assert (correlation.abs() < 5 / 20000**0.5).all()
+    assert (draw @ draw.T / 20000 * 3 - torch.eye(3)).abs().max() < 5 / 20000**0.5
+    assert reference.uniform(seed, counter).equal(draw)
+    large = reference.uniform(seed, counter + 2**33)
+    assert large.min() >= -1
+    assert large.max() < 1
+
+
+def test_hash_is_that_of_murmur3():
+    """Against plain integers."""
+    word = 2**32 - 1
+
+    def hashed(seed, counter):
+        z = (seed + counter * 0x9E3779B9) & word
+        z = ((z ^ (z >> 16)) * 0x85EBCA6B) & word
+        z = ((z ^ (z >> 13)) * 0xC2B2AE35) & word
+        return ((z ^ (z >> 16)) >> 8) * 2.0**-23 - 1
+
+    for seed in (0, 7, 2**31, word):
+        for counter in (0, 1, 12345, 2**31, 2**40 + 3):
+            assert reference.uniform(torch.tensor(seed), torch.tensor(counter)).item() == hashed(seed, counter)
