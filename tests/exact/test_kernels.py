@@ -62,8 +62,9 @@ def bipartite(n_first, n_second, n_problems, seed=0):
 
 
 def listed(n, n_problems, seed=0):
-    matrix = normal(n_problems, n, n, seed=seed)
-    return Qubo.from_matrix(matrix * (normal(n, n, seed=seed + 1) > 0.2), normal(n_problems, seed=seed + 2))
+    """Every variable has a linear term: rounding decides where a field is exactly 0."""
+    used = (normal(n, n, seed=seed + 1) > 0.2) | torch.eye(n, dtype=torch.bool)
+    return Qubo.from_matrix(normal(n_problems, n, n, seed=seed) * used, normal(n_problems, seed=seed + 2))
 
 
 def maxsat(n, n_problems, lengths=((3, 40), (4, 9), (5, 4)), n_pairs=20, seed=0):
