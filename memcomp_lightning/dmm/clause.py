@@ -4,6 +4,7 @@ Sources: [B] Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), the 3-SAT form,
 two-literal form as in public research code of the same group. Constants: docs/dmm.md.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -107,12 +108,14 @@ class ClauseField:
         n_axes = len(maxsat.graph.edge_shape)
         longer = _padded(maxsat)
         # Longer clauses stand behind the pairs while the scale is found.
-        n_pairs = maxsat.weight[0].numel() if maxsat.problems else maxsat.weight.numel()
+        n_pairs = math.prod(maxsat.graph.edge_shape)
         flat = torch.cat((maxsat.weight.reshape(*maxsat.problems, n_pairs), longer.weight), dim=-1)
         flat, unit = by_largest(flat, maxsat.unit, 1)
         weight = flat[..., :n_pairs].reshape(maxsat.weight.shape)
         longer_weight = flat[..., n_pairs:]
-        scale = coupling_norm(maxsat.graph, weight) if n_pairs else _clause_norm(longer, longer_weight)
+        scale = coupling_norm(maxsat.graph, weight)
+        if maxsat.longer:
+            scale = torch.where((flat[..., :n_pairs] == 0).all(-1), _clause_norm(longer, longer_weight), scale)
         weight, unit = weight / expand(scale, n_axes), unit / scale.unsqueeze(-1)
         if not maxsat.longer:
             unit = decisive(maxsat.graph, weight, unit)

@@ -1,5 +1,6 @@
 """Integrators: one step of the machine's ODE. One class a scheme."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -13,13 +14,25 @@ MachineT = TypeVar("MachineT")
 StateT = TypeVar("StateT", bound=HasVoltage)
 
 
+Shake = Callable[[Any, Tensor], Any]
+"""From a state and the step sizes to the state with noise on its voltages."""
+
+
+def still(state: Any, dt: Tensor) -> Any:
+    """No noise."""
+    return state
+
+
 class Integrator(Protocol):
     """Advances all restarts of all problems by one step, each with a step size of its own."""
 
     def step(
-        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
+        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT, shake: Shake = still
     ) -> tuple[StateT, Tensor]:
-        """Return the next state and the step sizes ``(*problems, n_restarts)``."""
+        """Return the next state and the step sizes ``(*problems, n_restarts)``.
+
+        ``shake`` adds the noise of a step to the voltages, once they have moved and before they are bounded.
+        """
         ...
 
 
@@ -56,12 +69,12 @@ class AdaptiveEuler(StepControl):
     """Forward Euler: voltages and memories move together. One evaluation a step."""
 
     def step(
-        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
+        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT, shake: Shake = still
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
         dt = self.step_size(rate.voltage, field.stability(machine))
-        return field.bound(machine, _move(state, rate, dt)), dt
+        return field.bound(machine, shake(_move(state, rate, dt), dt)), dt
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,12 +85,12 @@ class Splitting(StepControl):
     """
 
     def step(
-        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
+        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT, shake: Shake = still
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
         dt = self.step_size(rate.voltage, field.stability(machine))
-        state = field.bound(machine, _move_voltage(state, rate, dt))
+        state = field.bound(machine, shake(_move_voltage(state, rate, dt), dt))
         return _move_memories(field, machine, state, dt), dt
 
 
@@ -86,13 +99,13 @@ class Strang(StepControl):
     """Strang splitting: half a step of the memories, a full one of the voltages, half a step of the memories."""
 
     def step(
-        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
+        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT, shake: Shake = still
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         dt = self.step_size(field.derivative(machine, state).voltage, field.stability(machine))
         state = _move_memories(field, machine, state, dt / 2)
         rate = field.derivative(machine, state)
-        state = field.bound(machine, _move_voltage(state, rate, dt))
+        state = field.bound(machine, shake(_move_voltage(state, rate, dt), dt))
         return _move_memories(field, machine, state, dt / 2), dt
 
 
@@ -103,7 +116,7 @@ class ExactShortTerm(StepControl):
     The field must offer ``short_term_after(machine, state, dt)``; removes the stiffness of x_s.
     """
 
-    def step(self, field: Any, machine: MachineT, state: StateT) -> tuple[StateT, Tensor]:
+    def step(self, field: Any, machine: MachineT, state: StateT, shake: Shake = still) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         require(
             hasattr(field, "short_term_after"),
@@ -114,7 +127,7 @@ class ExactShortTerm(StepControl):
         )
         rate = field.derivative(machine, state)
         dt = self.step_size(rate.voltage, field.stability(machine))
-        state = field.bound(machine, _move_voltage(state, rate, dt))
+        state = field.bound(machine, shake(_move_voltage(state, rate, dt), dt))
         exact = field.short_term_after(machine, state, dt)
         moved = _move_memories(field, machine, state, dt)
         return field.bound(machine, moved._replace(**exact)), dt
@@ -125,14 +138,14 @@ class Heun(StepControl):
     """Heun's method: the mean of the rates at both ends of an Euler step. Two evaluations, second order."""
 
     def step(
-        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT
+        self, field: VectorField[MachineT, StateT], machine: MachineT, state: StateT, shake: Shake = still
     ) -> tuple[StateT, Tensor]:
         """Return the next state and the step sizes."""
         rate = field.derivative(machine, state)
         dt = self.step_size(rate.voltage, field.stability(machine))
         ahead = field.derivative(machine, field.bound(machine, _move(state, rate, dt)))
         mean = type(rate)(*((a + b) / 2 for a, b in zip(_tensors(rate), _tensors(ahead), strict=True)))
-        return field.bound(machine, _move(state, mean, dt)), dt
+        return field.bound(machine, shake(_move(state, mean, dt), dt)), dt
 
 
 def _move(state: StateT, rate: StateT, dt: Tensor) -> StateT:

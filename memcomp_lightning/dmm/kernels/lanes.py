@@ -41,7 +41,7 @@ def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
             s = min(top, max(epsilon, m[short + k] * (one + dt[k] * beta * (unsatisfied - gamma))))
             x = m[long + k]
             excess = dt[k] * alpha * (unsatisfied - delta)
-            x = min(cap, x + excess * (one if excess > zero else x))
+            x = min(cap, max(F32(0), x + excess * (one if excess > zero else x)))
             m[short + k] = s
             m[long + k] = x
             agile = w * (s - epsilon)
@@ -118,7 +118,7 @@ def longer_pass(variables, polarity, weight, memory, voltage, rate, falsehood, c
             s = min(one + epsilon, max(epsilon, memory[e, 0, k] * (one + dt[k] * beta * (smallest - gamma))))
             x = memory[e, 1, k]
             excess = dt[k] * alpha * (smallest - delta)
-            x = min(cap, x + excess * (one if excess > zero else x))
+            x = min(cap, max(F32(0), x + excess * (one if excess > zero else x)))
             memory[e, 0, k] = s
             memory[e, 1, k] = x
             agile = w * (s - epsilon)
@@ -139,7 +139,7 @@ def clause_units(unit, long, voltage, rate, c, dt):
         sign = half if u > 0 else (-half if u < 0 else F32(0))
         for k in range(dt.size):
             excess = dt[k] * alpha * (half - sign * voltage[i, k] - delta)
-            long[i, k] = min(cap, long[i, k] + excess * (one if excess > 0 else long[i, k]))
+            long[i, k] = min(cap, max(F32(0), long[i, k] + excess * (one if excess > 0 else long[i, k])))
         for k in range(dt.size):
             rate[i, 0, k] += strength * u * (one + long[i, k])
 
@@ -290,9 +290,14 @@ def keep_best(x, energy, lowest, found_at, best, step):
     """Remember the states that are the lowest of their lane so far."""
     for k in range(energy.size):
         if energy[k] < lowest[k]:
-            lowest[k], found_at[k] = energy[k], step
+            lowest[k] = energy[k]
+            new = step == 0
             for i in range(x.shape[0]):
-                best[k, i] = x[i, k]
+                new |= best[k, i] != x[i, k]
+            if new:
+                found_at[k] = step
+                for i in range(x.shape[0]):
+                    best[k, i] = x[i, k]
 
 
 @njit(nogil=True, cache=True)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.dmm.base import Recording, VectorField
-from memcomp_lightning.dmm.integrate import Integrator
+from memcomp_lightning.dmm.integrate import Integrator, Shake, still
 from memcomp_lightning.dmm.kernels.run import Run, Start, Visited
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat
 from memcomp_lightning.qubo.qubo import Qubo
@@ -47,8 +47,7 @@ def run(
     states: list[Tensor] = []
     for step in range(n_steps + 1):
         if step > 0:
-            state, dt = integrator.step(field, machine, state)
-            state = _shaken(field.noise, state, dt, start.seed, step - 1)
+            state, dt = integrator.step(field, machine, state, _shake(field.noise, start.seed, step - 1))
             time = time + dt
         x = state.voltage > 0
         if quench_every == 0 or step % quench_every == 0:
@@ -99,15 +98,18 @@ def uniform(seed: Tensor, counter: Tensor) -> Tensor:
     return (z >> 8) * 2.0**-23 - 1
 
 
-def _shaken(noise: float, state: Any, dt: Tensor, seed: Tensor, step: int) -> Any:
-    """Add the noise of one step to the voltages."""
+def _shake(noise: float, seed: Tensor, step: int) -> Shake:
+    """The noise of one step on the voltages."""
     if noise == 0:
-        return state
-    n = state.voltage.shape[-1]
-    counter = step * n + torch.arange(n, device=seed.device)
-    shake = uniform(seed.unsqueeze(-1), counter).to(state.voltage.dtype)
-    width = noise * dt.sqrt().unsqueeze(-1)
-    return state._replace(voltage=(state.voltage + width * shake).clamp(-1, 1))
+        return still
+
+    def shake(state: Any, dt: Tensor) -> Any:
+        n = state.voltage.shape[-1]
+        counter = step * n + torch.arange(n, device=seed.device)
+        kick = uniform(seed.unsqueeze(-1), counter).to(state.voltage.dtype)
+        return state._replace(voltage=state.voltage + noise * dt.sqrt().unsqueeze(-1) * kick)
+
+    return shake
 
 
 def _warmed(state: Any, kept: tuple[Tensor, ...]) -> Any:

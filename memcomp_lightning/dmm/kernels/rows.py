@@ -41,7 +41,7 @@ def clause_pass(weight, board, short, long, voltage, drive, c, dt):
             s = min(top, max(epsilon, short_row[j] * (keep + growth * unsatisfied)))
             x = long_row[j]
             excess = fall + rise * unsatisfied
-            x = min(cap, x + excess * (one if excess > zero else x))
+            x = min(cap, max(F32(0), x + excess * (one if excess > zero else x)))
             short_row[j] = s
             long_row[j] = x
             size = abs(w)
@@ -64,7 +64,7 @@ def clause_units(unit, long, voltage, drive, c, dt):
         sign = half if u > 0 else (-half if u < 0 else F32(0))
         excess = dt * alpha * (half - sign * voltage[i] - delta)
         x = long[i]
-        long[i] = min(cap, x + excess * (one if excess > 0 else x))
+        long[i] = min(cap, max(F32(0), x + excess * (one if excess > 0 else x)))
         drive[i] += pull * u * (one + long[i])
 
 
@@ -279,15 +279,25 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
             if n_reads % REFRESH == 0:
                 energy = local_fields(coupling, linear, x, field)
         if reads and changed and energy < lowest:
-            lowest, found_at = energy, step
-            best[:] = x
+            lowest = energy
+            new = False
+            for i in range(n):
+                new |= best[i] != x[i]
+            if new or step == 0:
+                found_at = step
+                best[:] = x
         if reads and changed and quench_every > 0:
             tried[:] = x
             tried_field[:] = field
             reached = energy + quench(coupling, transposed, tried, tried_field)
             if reached < lowest:
-                lowest, found_at = reached, step
-                best[:] = tried
+                lowest = reached
+                new = False
+                for i in range(n):
+                    new |= best[i] != tried[i]
+                if new or step == 0:
+                    found_at = step
+                    best[:] = tried
             changed = False
         if recorded:
             times[step // every - 1] = elapsed
