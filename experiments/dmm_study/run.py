@@ -146,7 +146,7 @@ def integrators(study: Study) -> None:
     labels = []
     for name, (scheme, evaluations) in schemes.items():
         for change in changes:
-            integrator = scheme(max_change=change, dt_min=own.dt_min, dt_max=own.dt_max)  # type: ignore[attr-defined]
+            integrator = scheme(change=change, dt_min=own.dt_min, dt_max=own.dt_max)  # type: ignore[attr-defined]
             label = f"{name}, {change:g}"
             solver = DmmSolver(
                 integrator=integrator, max_steps=budget // evaluations, n_restarts=N_RESTARTS, kernel="reference"

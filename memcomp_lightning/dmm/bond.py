@@ -90,7 +90,7 @@ class BondField:
     long_term_max: float = 4.15
     noise: float = 0.79
     spread: float = 1.0
-    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=1.0, dt_min=0.183, dt_max=0.183))
+    integrator: Integrator = field(default_factory=lambda: Splitting(change=1.0, dt_min=0.183, dt_max=0.183))
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "gamma", "delta", "zeta"):

@@ -12,7 +12,15 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
-from memcomp_lightning.dmm.scaling import by_largest, collective_mode, coupling_norm, decisive, expand
+from memcomp_lightning.dmm.scaling import (
+    by_largest,
+    collective_mode,
+    coupling_norm,
+    decisive,
+    expand,
+    n_coupled,
+    step_scale,
+)
 from memcomp_lightning.errors import require
 from memcomp_lightning.qubo.graph import Graph
 from memcomp_lightning.qubo.maxsat import Clauses, WeightedMaxSat, from_qubo
@@ -80,17 +88,19 @@ class ClauseField:
         integrator: The scheme that the constants were chosen with.
     """
 
-    alpha: float = 29.7
-    beta: float = 0.106
-    gamma: float = 0.0239
-    delta: float = 0.0098
-    epsilon: float = 0.52
-    zeta: float = 0.040
-    long_term_max: float = 13.5
-    unit_pull: float = 0.995
+    alpha: float = 25.0
+    beta: float = 0.14
+    gamma: float = 0.021
+    delta: float = 0.0139
+    epsilon: float = 0.47
+    zeta: float = 0.0
+    long_term_max: float = 6.4
+    unit_pull: float = 1.0
     noise: float = 0.0
-    spread: float = 0.3
-    integrator: Integrator = field(default_factory=lambda: Splitting(max_change=3.66, dt_min=0.0126, dt_max=1.92))
+    spread: float = 0.4
+    integrator: Integrator = field(
+        default_factory=lambda: Splitting(change=1.0, dt_min=0.0126, dt_max=6.0, lag=0.28)
+    )
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta", "epsilon", "unit_pull"):
@@ -119,6 +129,10 @@ class ClauseField:
         weight, unit = weight / expand(scale, n_axes), unit / scale.unsqueeze(-1)
         if not maxsat.longer:
             unit = decisive(maxsat.graph, weight, unit)
+        n_used = n_coupled(maxsat.graph, weight)
+        if maxsat.longer:
+            n_used = torch.maximum(n_used, _n_in_clauses(longer, longer_weight))
+        collective = collective_mode(maxsat.graph, weight * maxsat.first * maxsat.second)
         return ClauseMachine(
             graph=maxsat.graph,
             weight=weight.unsqueeze(-1 - n_axes),
@@ -129,7 +143,7 @@ class ClauseField:
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
             longer_weight=(longer_weight / scale.unsqueeze(-1)).unsqueeze(-2),
-            stability=collective_mode(maxsat.graph, weight * maxsat.first * maxsat.second).unsqueeze(-1),
+            stability=step_scale(maxsat.n, n_used, collective).unsqueeze(-1),
         )
 
     def stability(self, machine: ClauseMachine) -> Tensor:
@@ -261,11 +275,21 @@ def _padded(maxsat: WeightedMaxSat) -> Clauses:
     )
 
 
-def _clause_norm(clauses: Clauses, weight: Tensor) -> Tensor:
-    """The scale where there are no pairs: root mean square over the variables of their clauses' weights."""
+def _clause_power(clauses: Clauses, weight: Tensor) -> Tensor:
+    """Sum of the squared weights of each variable's clauses, ``(*problems, n)`` for the variables that occur."""
     n = int(clauses.variables.max()) + 1 if clauses.variables.numel() else 1
     power = weight.new_zeros(*weight.shape[:-1], n)
     per_literal = weight.square().unsqueeze(-1) * (clauses.polarity != 0)
-    power.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))
+    return power.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))
+
+
+def _n_in_clauses(clauses: Clauses, weight: Tensor) -> Tensor:
+    """Number of variables in clauses with a weight."""
+    return (_clause_power(clauses, (weight != 0).to(weight.dtype)) > 0).sum(-1)
+
+
+def _clause_norm(clauses: Clauses, weight: Tensor) -> Tensor:
+    """The scale where there are no pairs: root mean square over the variables of their clauses' weights."""
+    power = _clause_power(clauses, weight)
     norm = (power.sum(-1) / (power > 0).sum(-1).clamp(min=1)).sqrt()
     return torch.where(norm > 0, norm, torch.ones_like(norm))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from memcomp_lightning.qubo.graph import Graph
 
-_SMALLEST_RATIO = 1e-12
+SMALLEST_RATIO = 1e-12
 """Couplings this much smaller than the largest unit clause or field do not set the scale."""
 
 
@@ -35,7 +35,34 @@ def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
     power = coupling.square()
     per_variable = graph.scatter(power, power)
     norm = (per_variable.sum(-1) / (per_variable > 0).sum(-1).clamp(min=1)).sqrt()
-    return torch.where(norm > _SMALLEST_RATIO, norm, torch.ones_like(norm))
+    return torch.where(norm > SMALLEST_RATIO, norm, torch.ones_like(norm))
+
+
+def n_coupled(graph: Graph, coupling: Tensor) -> Tensor:
+    """Number of variables with a coupling that is not 0, ``(*problems,)``."""
+    used = (coupling != 0).to(coupling.dtype)
+    return (graph.scatter(used, used) > 0).sum(-1)
+
+
+def step_scale(n: int, n_coupled: Tensor, collective: Tensor) -> Tensor:
+    r"""What a step that suits 200 independent variables is multiplied by, ``(*problems,)``.
+
+    .. math:: \text{collective} \cdot (n_c / 200)^{-SIZE_EXPONENT} \sqrt{n_c / n}
+
+    Larger problems want smaller steps (measured); the root takes off what variables without couplings add to the
+    number of variables in a root mean square.
+
+    Args:
+        n: Number of variables.
+        n_coupled: Number n_c of those that are coupled, ``(*problems,)``.
+        collective: From :func:`collective_mode`.
+    """
+    count = n_coupled.clamp(min=1).to(collective.dtype)
+    return collective * (count / 200) ** -SIZE_EXPONENT * (count / n).sqrt()
+
+
+SIZE_EXPONENT = 0.3
+"""How the best step falls with the number of variables."""
 
 
 def collective_mode(graph: Graph, coupling: Tensor) -> Tensor:
@@ -53,15 +80,15 @@ def collective_mode(graph: Graph, coupling: Tensor) -> Tensor:
     problems = coupling.shape[: coupling.ndim - len(graph.edge_shape)]
     n = torch.arange(graph.n, device=coupling.device, dtype=coupling.dtype)
     x = (1 + 0.5 * torch.sin(n * n)).expand(*problems, 1, graph.n)
-    for _ in range(_POWER_ITERATIONS):
+    for _ in range(POWER_ITERATIONS):
         x = graph.field(coupling, x)
     before = x.norm(dim=-1, keepdim=True)
-    x = graph.field(coupling, x / before.clamp(min=_SMALLEST_RATIO))
+    x = graph.field(coupling, x / before.clamp(min=SMALLEST_RATIO))
     largest = x.norm(dim=-1).squeeze(-1)
-    return torch.clamp(2 / largest.clamp(min=_SMALLEST_RATIO), max=1)
+    return torch.clamp(2 / largest.clamp(min=SMALLEST_RATIO), max=1)
 
 
-_POWER_ITERATIONS = 5
+POWER_ITERATIONS = 5
 """A collective mode stands out of the spectrum: a few iterations find it."""
 
 
@@ -70,7 +97,7 @@ def mean_strength(graph: Graph, coupling: Tensor) -> Tensor:
     size = coupling.abs()
     per_variable = graph.scatter(size, size)
     mean = per_variable.sum(-1) / (per_variable > 0).sum(-1).clamp(min=1)
-    return torch.where(mean > _SMALLEST_RATIO, mean, torch.ones_like(mean))
+    return torch.where(mean > SMALLEST_RATIO, mean, torch.ones_like(mean))
 
 
 def decisive(graph: Graph, coupling: Tensor, linear: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Generator, Tensor
@@ -19,7 +19,7 @@ from memcomp_lightning.dmm.bond import BondField
 from memcomp_lightning.dmm.clause import ClauseField
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.kernels import reference
-from memcomp_lightning.dmm.kernels.run import Run, Start
+from memcomp_lightning.dmm.kernels.run import Run, Stall, Start
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.qubo.graph import Bipartite, EdgeList
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo
@@ -59,7 +59,9 @@ class DmmSolver:
         n_restarts: Most restarts a problem, >= 1 (the paper: 28).
         patience: Restarts without a better assignment after which a problem is done, 1 to n_restarts; None
             runs all restarts at once.
-        max_steps: Integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
+        max_steps: Most integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
+        stall: A restart ends early once it has done :func:`default_min_steps` and this many steps more for each
+            that its best assignment took, > 0; None lets all run for ``max_steps``. Recorded ones always do.
         quench_every: Each so many steps the digital state is read, and a copy of it descends by single flips;
             the machine does not feel it. 0 reads at every step, without a descent. None takes
             :func:`default_quench` of the problem.
@@ -79,6 +81,7 @@ class DmmSolver:
     n_restarts: int = 28
     patience: int | None = None
     max_steps: int | None = None
+    stall: float | None = 2.0
     quench_every: int | None = None
     warm: WarmRestart | None = None
     record: Recording | None = None
@@ -89,6 +92,8 @@ class DmmSolver:
         for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), smallest)
+        if self.stall is not None:
+            require(0 < self.stall < math.inf, "stall", self.stall, "a number > 0, or null")
         if self.patience is not None:
             require(
                 self.patience <= self.n_restarts,
@@ -127,14 +132,12 @@ class DmmSolver:
         """
         begin = time.perf_counter()
         flat = _flatten(_without_zeros(problem))
-        n_problems, n, device = flat.offset.shape[0], flat.n, flat.offset.device
+        n_problems, device = flat.offset.shape[0], flat.offset.device
         n_steps = self.max_steps or default_steps(flat)
         group_size = self.patience or self.n_restarts
-        best = torch.zeros(n_problems, self.n_restarts, n, dtype=torch.bool, device=device)
-        energies = torch.full((n_problems, self.n_restarts), torch.inf, dtype=torch.float64, device=device)
-        found_at = torch.zeros(n_problems, self.n_restarts, dtype=torch.int64, device=device)
-        visited: list[tuple[Tensor, slice, Trajectory]] = []
+        parts, shape = list[_Part](), (n_problems, self.n_restarts)
         active = torch.arange(n_problems, device=device)
+        lowest = torch.full((n_problems,), torch.inf, dtype=torch.float64, device=device)
         lowest_at = torch.zeros(n_problems, dtype=torch.int64, device=device)
         before: Run | None = None
         for done in range(0, self.n_restarts, group_size):
@@ -142,31 +145,40 @@ class DmmSolver:
             part = flat if len(active) == n_problems else _select(flat, active)
             start = self._start(part, group.stop - group.start, before, generator)
             run = self._run(part, start, n_steps)
-            found = part.energy(run.best)
-            lowest, at = found.min(-1)
-            better = lowest < energies[active].amin(-1)
-            lowest_at[active] = torch.where(better, done + at, lowest_at[active])
-            best[active, group], energies[active, group], found_at[active, group] = run.best, found, run.found_at
-            if run.visited is not None:
-                visited.append((active, group, _trajectory(part, run.visited.time, run.visited.states)))
+            energies = part.energy(run.best)
+            visited = run.visited and _trajectory(part, run.visited.time, run.visited.states)
+            parts.append(_Part(active, group, run, energies, visited))
+            if group.stop == self.n_restarts:
+                break
+            found, at = energies.min(-1)
+            lowest_at[active] = torch.where(found < lowest[active], done + at, lowest_at[active])
+            lowest[active] = torch.minimum(found, lowest[active])
             going_on = group.stop - 1 - lowest_at[active] < group_size
             active = active[going_on]
             if not active.numel():
                 break
             if self.warm is not None:
                 before = run._replace(voltage=run.voltage[going_on], kept=tuple(m[going_on] for m in run.kept))
-        was_run = energies.isfinite()
-        status = torch.where(found_at > 0.9 * n_steps, Status.STILL_IMPROVING, Status.STEP_BUDGET)
-        status = status.masked_fill(~was_run, Status.NOT_RUN)
-        shape = (*problem.problems, self.n_restarts)
-        dtype = problem.linear.dtype if isinstance(problem, Qubo) else problem.unit.dtype
+
+        def whole(pick: Callable[[_Part], Tensor], elsewhere: float = 0) -> Tensor:
+            joined = _join([(part.problems, part.restarts, pick(part)) for part in parts], shape, elsewhere)
+            return joined.reshape(*problem.problems, *joined.shape[1:])
+
+        steps, found_at = whole(lambda part: part.run.steps), whole(lambda part: part.run.found_at)
+        status = torch.where(steps < n_steps, Status.STALLED, Status.STEP_BUDGET)
+        status = status.masked_fill(found_at > 0.9 * n_steps, Status.STILL_IMPROVING)
+        energies = whole(lambda part: part.energies, torch.inf)
+        trajectory = None
+        if self.record is not None and parts[0].visited is not None:
+            columns = range(len(Trajectory._fields))
+            trajectory = Trajectory(*(whole(lambda part, k=k: part.visited[k]) for k in columns))  # type: ignore[misc]
         return QuboSolution(
-            assignments=best.to(dtype).reshape(*shape, n),
-            energies=energies.reshape(shape),
-            status=status.reshape(shape),
-            steps=(was_run * n_steps).reshape(shape),
+            assignments=whole(lambda part: part.run.best).to(start.voltage.dtype),
+            energies=energies,
+            status=status.masked_fill(energies.isinf(), Status.NOT_RUN),
+            steps=steps,
             wall_time_s=time.perf_counter() - begin,
-            trajectory=_join(visited, n_problems, self.n_restarts, problem.problems),
+            trajectory=trajectory,
         )
 
     def _start(
@@ -201,6 +213,8 @@ class DmmSolver:
             n_steps=n_steps,
             quench_every=default_quench(problem) if self.quench_every is None else self.quench_every,
             recording=self.record,
+            stall=None if self.stall is None else Stall(default_min_steps(problem), self.stall),
+            remember=self.warm is not None,
         )
 
     def _obstacle(self, device: str) -> str | None:
@@ -208,6 +222,8 @@ class DmmSolver:
         integrator = self.integrator or self.field.integrator
         if type(self.field) not in (ClauseField, BondField):
             return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
+        if isinstance(self.field, ClauseField) and self.field.zeta > 0:
+            return f"zeta = {self.field.zeta:g} has no compiled kernel: set it to 0 for speed."
         if type(integrator) is not Splitting:
             return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
         if device != "cpu":
@@ -217,9 +233,24 @@ class DmmSolver:
         return _import_failure()
 
 
+class _Part(NamedTuple):
+    """A group of restarts of the problems that were not done by then."""
+
+    problems: Tensor
+    restarts: slice
+    run: Run
+    energies: Tensor
+    visited: Trajectory | None
+
+
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
     """Steps a restart, by the rule ``3 n^(4/5)`` of the number of variables, at least 50."""
     return max(50, round(3 * math.pow(problem.n, 0.8)))
+
+
+def default_min_steps(problem: Qubo | WeightedMaxSat) -> int:
+    """Steps that each restart gets before it may stall."""
+    return 8
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:
@@ -276,6 +307,8 @@ def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
     """Two layers of which few variables are coupled, as a list of the couplings that are there."""
     if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
         return problem
+    if problem.coupling.count_nonzero() > _SPARSE * problem.coupling.numel():
+        return problem
     used = (problem.coupling != 0).reshape(-1, *problem.graph.edge_shape).any(0).flatten()
     if used.sum() > _SPARSE * used.numel():
         return problem
@@ -291,6 +324,8 @@ _SPARSE = 0.25
 def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
     """All problems on one leading axis."""
     n_problems, axes = math.prod(problem.problems), len(problem.problems)
+    if axes == 1:
+        return problem
     return _map(problem, lambda x: x.reshape(n_problems, *x.shape[axes:]))
 
 
@@ -308,17 +343,12 @@ def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -
     return Trajectory(times, energies - offset[:, None, None], states, dwell)
 
 
-def _join(
-    parts: list[tuple[Tensor, slice, Trajectory]], n_problems: int, n_restarts: int, problems: tuple[int, ...]
-) -> Trajectory | None:
-    """Trajectories of all groups of restarts; zeros where a restart was not run."""
-    if not parts:
-        return None
-    columns: list[Tensor] = []
-    for column in range(len(Trajectory._fields)):
-        sample: Tensor = parts[0][2][column]
-        joined = sample.new_zeros(n_problems, n_restarts, *sample.shape[2:])
-        for active, group, trajectory in parts:
-            joined[active, group] = trajectory[column]
-        columns.append(joined.reshape(*problems, n_restarts, *sample.shape[2:]))
-    return Trajectory(*columns)
+def _join(parts: list[tuple[Tensor, slice, Tensor]], shape: tuple[int, int], elsewhere: float) -> Tensor:
+    """What all groups returned, ``(n_problems, n_restarts, ...)``; ``elsewhere`` where no restart was run."""
+    first = parts[0][2]
+    if first.shape[:2] == shape:
+        return first
+    joined = first.new_full((*shape, *first.shape[2:]), elsewhere)
+    for problems, restarts, values in parts:
+        joined[problems, restarts] = values
+    return joined

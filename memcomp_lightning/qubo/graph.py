@@ -105,9 +105,9 @@ class Bipartite:
         return torch.cat((second @ coupling, first @ coupling.mT), dim=-1)
 
     def alternating(self) -> Tensor:
-        """A checkerboard."""
-        second, first = torch.arange(self.n_second).unsqueeze(-1), torch.arange(self.n_first)
-        return 1.0 - 2 * ((second + first) % 2)
+        """+1 between the first halves of both layers and between their second halves."""
+        second, first = (2 * torch.arange(n) >= n for n in (self.n_second, self.n_first))
+        return 1.0 - 2 * (second.unsqueeze(-1) ^ first)
 
     def blocks(self) -> Iterator[slice]:
         """The two layers."""

@@ -153,6 +153,7 @@ class Status(IntEnum):
     STEP_BUDGET = 2
     STILL_IMPROVING = 3
     NOT_RUN = 4
+    STALLED = 5
 
     @property
     def advice(self) -> str:
@@ -165,6 +166,7 @@ _ADVICE = {
     Status.CONVERGED: "No block of variables improves this assignment; more restarts may find a lower one.",
     Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
     Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
+    Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
     Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
 }
 

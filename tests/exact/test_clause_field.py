@@ -255,12 +255,12 @@ def test_solution_is_a_fixed_point_of_the_bounded_voltages():
 
 def test_bounds_are_reached_and_never_crossed():
     field = ClauseField(alpha=7.6, beta=0.39, gamma=0.033, delta=0.0073, epsilon=0.041, long_term_max=3.3)
-    integrator = AdaptiveEuler(max_change=2.35, dt_min=0.0126, dt_max=2.8)
+    integrator = AdaptiveEuler(change=2.35, dt_min=0.0126, dt_max=2.8)
     machine = field.build(from_model(small_rbm(11, 7).double()))
     state = field.init(machine, uniform(5, 18, low=-1, high=1, seed=0))
     reached = {"short": False, "long": False}
     for _ in range(211):
-        state, _ = integrator.step(field, machine, state)
+        state, _, _ = integrator.step(field, machine, state)
         assert state.voltage.abs().max() <= 1
         assert state.short_term.min() >= 0
         assert state.short_term.max() <= 1

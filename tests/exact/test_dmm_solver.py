@@ -288,11 +288,28 @@ class LateField(ScriptedField):
 )
 def test_status_tells_when_the_best_came(max_steps, status, energy):
     field = LateField([[0]])
-    steady = AdaptiveEuler(max_change=1.0, dt_min=0.1, dt_max=0.1)
-    solver = DmmSolver(field=field, integrator=steady, n_restarts=3, max_steps=max_steps, quench_every=0)
+    steady = AdaptiveEuler(change=1.0, dt_min=0.1, dt_max=0.1)
+    solver = DmmSolver(
+        field=field, integrator=steady, n_restarts=3, max_steps=max_steps, quench_every=0, stall=None
+    )
     solution = solve(solver, field.qubo())
     assert (solution.status == status).all()
     assert (solution.energies == energy).all()
+
+
+@pytest.mark.parametrize(("min_steps", "stall", "steps"), [(9, 0.5, 9), (12, 0.5, 17), (12, 3.0, 42)])
+def test_a_restart_that_finds_nothing_better_for_long_stalls(min_steps, stall, steps, monkeypatch):
+    monkeypatch.setattr(solver_module, "default_min_steps", lambda problem: min_steps)
+    field = LateField([[0]])
+    steady = AdaptiveEuler(change=1.0, dt_min=0.1, dt_max=0.1)
+    solver = DmmSolver(field=field, integrator=steady, n_restarts=3, max_steps=50, quench_every=0, stall=stall)
+    solution = solve(solver, field.qubo())
+    assert (solution.status == Status.STALLED).all()
+    assert (solution.steps == steps).all()
+    assert (solution.energies == (0 if steps < 10 else -1)).all()
+    full = solve(dataclasses.replace(solver, stall=None), field.qubo())
+    assert (full.steps == 50).all()
+    assert (full.status == Status.STEP_BUDGET).all()
 
 
 # --- steps, readings, warm restarts -----------------------------------------------------------------------
@@ -368,7 +385,7 @@ def test_descents_never_make_the_answer_worse(problem, field, kernel):
     assert (often < plain - 1e-3).any()
 
 
-CREEPING = Splitting(max_change=0.1, dt_min=0.001, dt_max=0.2)
+CREEPING = Splitting(change=0.1, dt_min=0.001, dt_max=0.2)
 
 
 @either_kernel
@@ -642,7 +659,7 @@ def test_dwell_times_add_up_to_the_time(kernel):
 
 
 def test_time_is_the_sum_of_the_step_sizes():
-    fixed = AdaptiveEuler(max_change=1.0, dt_min=0.25, dt_max=0.25)
+    fixed = AdaptiveEuler(change=1.0, dt_min=0.25, dt_max=0.25)
     trajectory = recorded(integrator=fixed)[1].trajectory
     assert trajectory.time.equal(torch.tensor([1.25, 2.5, 3.75, 5.0]).double().expand(2, 11, 4))
 

@@ -1,6 +1,7 @@
 """The compiled kernels against the readable one, step by step and after many steps."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,12 +10,12 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
 from memcomp_lightning.dmm.kernels import cpu, lanes, reference
-from memcomp_lightning.dmm.kernels.run import Start
+from memcomp_lightning.dmm.kernels.run import Stall, Start
 from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, Status, WeightedMaxSat, from_qubo
 from memcomp_lightning.qubo.maxsat import Clauses
 
 # Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
-SLOW = Splitting(max_change=0.6, dt_min=0.01, dt_max=0.4)
+SLOW = Splitting(change=0.3, dt_min=0.01, dt_max=0.4, lag=0.2)
 BONDS = BondField(
     alpha=1.5,
     beta=2.0,
@@ -36,7 +37,7 @@ FIELDS = {
         gamma=0.25,
         delta=0.1,
         epsilon=0.1,
-        zeta=0.3,
+        zeta=0.0,
         long_term_max=2.0,
         unit_pull=0.8,
         noise=0.0,
@@ -96,6 +97,10 @@ PROBLEMS = {
     "listed": listed(13, 3),
     "one listed": listed(13, 1),
 }
+SCALED = {
+    "ferromagnet": Qubo(Bipartite(13, 7), -torch.ones(1, 7, 13), normal(1, 20, seed=9), torch.zeros(1)),
+    "fields": Qubo(Bipartite(5, 7), normal(1, 7, 5), 1e4 * normal(1, 12, seed=9), torch.zeros(1)),
+}
 CLAUSES = {
     "pairs and longer clauses": maxsat(17, 2),
     "3-SAT": maxsat(17, 1, lengths=((3, 70),), n_pairs=0),
@@ -128,8 +133,8 @@ def start(problem, n_restarts, field, long_term_max=None, seed=0):
     return Start(field.spread * (2 * draw - 1), kept, seeds)
 
 
-def both(field, problem, begin, n_steps=8, quench_every=0, recording=Recording(every=1)):  # noqa: B008
-    settings = {"n_steps": n_steps, "quench_every": quench_every, "recording": recording}
+def both(field, problem, begin, n_steps=8, quench_every=0, recording=Recording(every=1), stall=None):  # noqa: B008
+    settings = {"n_steps": n_steps, "quench_every": quench_every, "recording": recording, "stall": stall}
     return tuple(kernel.run(field, field.integrator, problem, begin, **settings) for kernel in (reference, cpu))
 
 
@@ -138,6 +143,7 @@ def alike(problem, ours, theirs, tolerance=1e-3):
     for a, b in zip(ours.kept, theirs.kept, strict=False):
         torch.testing.assert_close(b, a, rtol=0, atol=tolerance)
     assert theirs.best.equal(ours.best)
+    assert theirs.steps.equal(ours.steps)
     assert (theirs.visited is None) == (ours.visited is None)
     if ours.visited is not None:
         torch.testing.assert_close(theirs.visited.time, ours.visited.time, rtol=1e-3, atol=0)
@@ -201,6 +207,85 @@ def test_same_ways_on_from_kept_memories(key, name):
     assert (forgot.voltage - ours.voltage).abs().max() > 0.05
 
 
+@pytest.mark.parametrize(
+    ("name", "quench_every"),
+    [("pairs and longer clauses", 0), *((name, k) for name in ("bipartite 17 + 11", "listed") for k in (0, 1, 3))],
+)
+def test_same_stalls(name, quench_every):
+    """A restart that has stalled keeps its voltages and memories, whatever its neighbours do.
+
+    With longer clauses the kernels quench by different flips, which changes when a restart stalls.
+    """
+    field, problem = FIELDS["clauses"], EVERY[name]
+    settings = {"n_steps": 9, "quench_every": quench_every, "recording": None}
+    ours, theirs = both(field, problem, start(problem, 33, field), stall=Stall(2, 1.5), **settings)
+    alike(problem, ours, theirs)
+    assert ours.found_at.equal(theirs.found_at)
+    assert len(ours.steps.unique()) > 1
+    reading = max(quench_every, 1)
+    due = (2 + 1.5 * ours.found_at).div(reading).ceil() * reading
+    assert (ours.steps == due.clamp(max=9)).all()
+    recorded = both(field, problem, start(problem, 5, field), n_steps=9, stall=Stall(1, 0.0))
+    assert all((run.steps == 9).all() for run in recorded)
+
+
+@pytest.mark.parametrize("key", ["clauses", "bonds"])
+def test_memories_are_returned_if_asked_for(key):
+    problem, field = PROBLEMS["bipartite 17 + 11"], FIELDS[key]
+    begin, settings = start(problem, 5, field), {"n_steps": 8, "quench_every": 1, "recording": None}
+    for kernel in (cpu, reference):
+        kept, forgotten = (
+            kernel.run(field, SLOW, problem, begin, **settings, remember=remember) for remember in (True, False)
+        )
+        assert kept.kept
+        assert not forgotten.kept
+        assert kept.voltage.equal(forgotten.voltage)
+
+
+# --- scaling ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+@pytest.mark.parametrize("name", ["bipartite 17 + 11", "bipartite 11 + 17", "one bipartite", *SCALED])
+@pytest.mark.parametrize("field", [ClauseField(), BondField()], ids=["clauses", "bonds"])
+def test_compiled_scaling_is_that_of_the_field(field, name, size):
+    """And the padding, which moves nothing, holds zeros."""
+    problem = (PROBLEMS | SCALED)[name]
+    problem = Qubo(problem.graph, size * problem.coupling, size * problem.linear, problem.offset)
+    machine, n_problems = field.build(problem), problem.offset.shape[0]
+    found = cpu._prepared(field, problem, problem.graph)
+    width, height, n_first, n_second = found.sizes
+
+    def matrix(x, rows=height, columns=width, used=(n_second, n_first)):
+        x = torch.from_numpy(x).reshape(n_problems, rows, columns)
+        assert not x[:, used[0] :].any()
+        assert not x[:, :, used[1] :].any()
+        return x[:, : used[0], : used[1]]
+
+    def vector(x):
+        x = torch.from_numpy(x)
+        assert not x[:, n_first:width].any()
+        assert not x[:, width + n_second :].any()
+        return torch.cat((x[:, :n_first], x[:, width : width + n_second]), dim=-1)
+
+    if isinstance(field, ClauseField):
+        weight, unit, scalars = machine.weight * machine.first, machine.unit, (machine.stability, 1.0)
+    else:
+        weight, unit, scalars = machine.bond, machine.field, (1.0, machine.pull_scale.squeeze(-1))
+    close = partial(torch.testing.assert_close, rtol=1e-4, atol=1e-5, check_dtype=False)
+    close(matrix(found.weight, n_second), weight.squeeze(-3))
+    close(vector(found.unit), unit.squeeze(-2))
+    for ours, theirs in zip(found.scalars.T, scalars, strict=True):
+        close(torch.from_numpy(ours.copy()), torch.as_tensor(theirs).expand(n_problems, 1).squeeze(-1))
+    coupling, linear = matrix(found.coupling), vector(found.linear)
+    ratio = linear / problem.linear
+    close(ratio, ratio[:, :1].expand(ratio.shape), rtol=1e-5)
+    close(ratio.log2(), ratio.log2().round())
+    close(coupling, problem.coupling * ratio[:, :1, None])
+    assert matrix(found.transposed, width, height, (n_first, n_second)).equal(coupling.mT)
+    assert max(coupling.abs().max(), linear.abs().max()) <= 1
+
+
 @pytest.mark.parametrize("name", ["bipartite 17 + 11", "listed", "pairs and longer clauses"])
 def test_large_steps_of_the_memories_end_at_their_bounds(name):
     """alpha delta dt > 1: an unbounded Euler step of a decaying memory would pass its lower bound."""
@@ -210,7 +295,7 @@ def test_large_steps_of_the_memories_end_at_their_bounds(name):
         gamma=0.3,
         delta=0.2,
         long_term_max=5.0,
-        integrator=Splitting(max_change=1.0, dt_min=0.5, dt_max=0.5),
+        integrator=Splitting(change=1.0, dt_min=0.5, dt_max=0.5),
     )
     problem = EVERY[name]
     ours, theirs = both(field, problem, start(problem, 17, field, 5.0), n_steps=3)

@@ -55,12 +55,14 @@ REFUSED = [
         (scheme, *refused)
         for scheme in SCHEMES
         for refused in (
-            ({"max_change": 0.0}, POSITIVE),
-            ({"max_change": math.nan}, POSITIVE),
+            ({"change": 0.0}, POSITIVE),
+            ({"change": math.nan}, POSITIVE),
             ({"dt_min": 0.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
             ({"dt_min": 3.0, "dt_max": 2.3}, "a number in (0, dt_max = 2.3]"),
         )
     ),
+    *((Splitting, {"lag": lag}, "a number in [0, 1/2]") for lag in (-0.1, 0.51, math.nan)),
+    *((DmmSolver, {"stall": stall}, "a number > 0, or null") for stall in (0.0, -1.0, math.inf, math.nan)),
     (ClauseField, {"alpha": 0.0}, POSITIVE),
     (ClauseField, {"alpha": math.nan}, POSITIVE),
     (ClauseField, {"beta": -0.1}, POSITIVE),

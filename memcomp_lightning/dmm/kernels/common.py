@@ -1,5 +1,6 @@
 """What the compiled kernels share: constants, step size, noise, the motion of the voltages."""
 
+import math
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,9 @@ REFRESH: Final = 64
 MAX_SWEEPS: Final = 1000
 """Ends a quench that rounding errors would keep alternating between equal energies."""
 
+TINY: Final = np.float32(1e-30)
+"""In place of a rate of 0, which asks for the longest step."""
+
 FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp", "nnan", "ninf"}
 """Sums may be reordered, which vector code needs; NaN and infinity keep their meaning."""
 
@@ -28,3 +32,41 @@ def uniform(seed, counter):
     z = ((z ^ (z >> np.uint64(13))) * np.uint64(0xC2B2AE35)) & np.uint64(0xFFFFFFFF)
     z = z ^ (z >> np.uint64(16))
     return F32(z >> np.uint64(8)) * F32(2.0**-23) - F32(1)
+
+
+@njit(nogil=True, inline="always", fastmath=FAST_MATH)
+def clause_rates(c, dt):
+    """What ``clause`` needs of the constants and the step: growth, keep, rise, fall, epsilon, top, cap."""
+    alpha, beta, gamma, delta, epsilon, one = c[0], c[1], c[2], c[3], c[4], F32(1)
+    return dt * beta, one - dt * beta * gamma, dt * alpha, -dt * alpha * delta, epsilon, one + epsilon, c[6] - one
+
+
+@njit(nogil=True, inline="always", fastmath=FAST_MATH)
+def clause(weight, voltage, false_second, short, long, rates):
+    """Advance the memories of one clause of two literals; ``ClauseField`` has the equations.
+
+    Args:
+        weight: With the polarity of the first literal as its sign.
+        voltage: Of the first literal's variable.
+        false_second: How false the second literal is.
+        short: x_s + epsilon.
+        long: x_l - 1.
+        rates: See ``clause_rates``.
+
+    Returns:
+        Both memories, the push on the first variable, and the push on the second over its polarity.
+    """
+    growth, keep, rise, fall, epsilon, top, cap = rates
+    zero, half, one = F32(0), F32(0.5), F32(1)
+    false_first = half - math.copysign(half, weight) * voltage
+    unsatisfied = min(false_first, false_second)
+    short = min(top, max(epsilon, short * (keep + growth * unsatisfied)))
+    excess = fall + rise * unsatisfied
+    long = min(cap, max(zero, long + excess * (one if excess > zero else long)))
+    agile = short - epsilon
+    gradient = agile + agile * long
+    rigidity = unsatisfied - agile * unsatisfied
+    at_first = rigidity if false_first <= false_second else zero
+    first = weight * (gradient * false_second + at_first)
+    second = abs(weight) * (gradient * false_first + (rigidity - at_first))
+    return short, long, first, second

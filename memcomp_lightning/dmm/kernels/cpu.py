@@ -18,7 +18,8 @@ from memcomp_lightning.dmm.clause import ClauseField, ClauseMachine
 from memcomp_lightning.dmm.integrate import Splitting
 from memcomp_lightning.dmm.kernels import lanes, rows
 from memcomp_lightning.dmm.kernels.common import BOND
-from memcomp_lightning.dmm.kernels.run import Run, Start, Visited
+from memcomp_lightning.dmm.kernels.prepare import prepare
+from memcomp_lightning.dmm.kernels.run import Run, Stall, Start, Visited
 from memcomp_lightning.qubo.graph import Bipartite
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.qubo.qubo import Qubo
@@ -26,11 +27,13 @@ from memcomp_lightning.qubo.qubo import Qubo
 log = logging.getLogger(__name__)
 
 Array = np.ndarray[Any, Any]
+Field = ClauseField | BondField
 Machine = ClauseMachine | BondMachine
+Steps = tuple[int, int, int, int, float]
 
 
 def run(
-    field: ClauseField | BondField,
+    field: Field,
     integrator: Splitting,
     problem: Qubo | WeightedMaxSat,
     start: Start,
@@ -38,58 +41,115 @@ def run(
     n_steps: int,
     quench_every: int,
     recording: Recording | None,
+    stall: Stall | None = None,
+    remember: bool = True,
 ) -> Run:
     """Do what ``reference.run`` does, for tensors on the CPU, in float32."""
-    steps = (n_steps, quench_every, recording.every if recording is not None else 0)
-    machine: Any = field.build(problem)
-    limits = np.array([integrator.max_change, integrator.dt_min, integrator.dt_max, field.noise], np.float32)
-    control = np.tile(limits, (start.voltage.shape[0], 1))
-    control[:, 0] *= _array(field.stability(machine)).reshape(-1)
-    constants = _constants(field, machine, start.voltage.shape[0])
+    every = recording.every if recording is not None else 0
+    min_steps, factor = (n_steps, 0.0) if stall is None or every else stall
+    steps = (n_steps, quench_every, every, min_steps, float(factor))
     if isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
-        return _run_rows(machine, problem, constants, control, start, steps)
-    return _run_lanes(machine, problem, constants, control, start, steps)
+        return _run_rows(field, integrator, problem, problem.graph, start, steps, remember)
+    return _run_lanes(field, integrator, problem, start, steps)
 
 
 def _run_rows(
-    machine: Machine, problem: Qubo, constants: Array, control: Array, start: Start, steps: tuple[int, int, int]
+    field: Field,
+    integrator: Splitting,
+    problem: Qubo,
+    graph: Bipartite,
+    start: Start,
+    steps: Steps,
+    remember: bool,
 ) -> Run:
     """Two fully coupled layers, one task a restart."""
     n_problems, n_restarts, n = start.voltage.shape
-    if isinstance(machine, BondMachine):
-        kind, weight, unit = BOND, machine.bond, machine.field
+    padded = _prepared(field, problem, graph)
+    width, height, n_first, n_second = padded.sizes
+    constants, control = _settings(field, integrator, padded.scalars[:, 0], padded.scalars[:, 1])
+    # The kernel divides the sum of the squared rates by the number of variables with the padding.
+    control[:, 0] *= np.sqrt(n / (width + height))
+    voltage = _pad(_array(start.voltage), n_first, width, width + height)
+    kept: list[Array] = [_array(memory) for memory in start.kept]
+    if kept:
+        matrix = kept[0].reshape(n_problems, n_restarts * n_second, n_first)
+        matrix = _pad(matrix, n_first, width, width).reshape(n_problems, n_restarts, n_second * width)
+        kept = [matrix, _pad(kept[1], n_first, width, width + height)]
     else:
-        kind, weight, unit = 1 - BOND, machine.first * machine.weight, machine.unit
-    coupling, linear = _digital(problem.coupling, problem.linear)
-    transposed = np.ascontiguousarray(np.swapaxes(coupling, -1, -2))
-    arrays = (kind, constants, _array(weight.squeeze(-3)), _array(unit.squeeze(-2)), coupling, transposed, linear)
-    voltage = _array(start.voltage).copy()
-    memories = _memories(((*voltage.shape[:2], *coupling.shape[1:]), voltage.shape), start.kept)
-    out = _outputs((n_problems, n_restarts), n, steps)
-    state = (voltage, *memories, _seeds(start.seed))
-    work = coupling.size * n_restarts * steps[0]
+        n_kept = n_restarts if remember else 0
+        kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in (n_second * width, width + height)]
+    arrays = (padded.kind, padded.sizes, padded.side, constants, *padded[4:])
+    out = _outputs((n_problems, n_restarts), width + height, steps)
+    state = (voltage, *kept, _seeds(start.seed))
+    work = padded.weight.size * n_restarts * steps[0]
     _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
-    return _finish(out, voltage, memories, steps)
+
+    def unpad(x: Array) -> Array:
+        return np.concatenate((x[..., :n_first], x[..., width : width + n_second]), axis=-1)
+
+    memories = []
+    if remember:
+        of_pairs = kept[0].reshape(n_problems, n_restarts, n_second, width)
+        memories = [np.ascontiguousarray(of_pairs[..., :n_first]), unpad(kept[1])]
+    return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps)
+
+
+def _pad(x: Array, n_first: int, width: int, size: int) -> Array:
+    """Move what is behind ``n_first`` on the last axis to behind ``width``; zeros elsewhere."""
+    padded = np.zeros((*x.shape[:-1], size), np.float32)
+    padded[..., :n_first] = x[..., :n_first]
+    padded[..., width : width + x.shape[-1] - n_first] = x[..., n_first:]
+    return padded
+
+
+class _Prepared(NamedTuple):
+    """Two fully coupled layers as the rows kernel reads them; ``prepare`` says what the arrays are."""
+
+    kind: int
+    sizes: tuple[int, int, int, int]
+    side: Array
+    scalars: Array
+    weight: Array
+    unit: Array
+    coupling: Array
+    transposed: Array
+    linear: Array
+
+
+def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
+    """Scale problems into the machine's units and into those of the digital state; pad the layers."""
+    n_problems, n_first, n_second = problem.offset.shape[0], graph.n_first, graph.n_second
+    width, height = (-(-n // _VECTOR) * _VECTOR for n in (n_first, n_second))
+    weight = np.zeros((n_problems, n_second * width), np.float32)
+    coupling, transposed = (np.zeros((n_problems, height * width), np.float32) for _ in range(2))
+    unit, linear = (np.zeros((n_problems, width + height), np.float32) for _ in range(2))
+    scalars = np.empty((n_problems, 2))
+    kind = BOND if isinstance(field, BondField) else 1 - BOND
+    given = [np.ascontiguousarray(x.detach().double().numpy()) for x in (problem.coupling, problem.linear)]
+    _announce(prepare)
+    compiled: Any = prepare
+    compiled(kind, width, height, *given, weight, unit, scalars, coupling, transposed, linear)
+    side = np.where(2 * np.arange(width) < n_first, np.float32(0.5), np.float32(-0.5))
+    sizes = (width, height, n_first, n_second)
+    return _Prepared(kind, sizes, side, scalars, weight, unit, coupling, transposed, linear)
 
 
 def _run_lanes(
-    machine: Machine,
-    problem: Qubo | WeightedMaxSat,
-    constants: Array,
-    control: Array,
-    start: Start,
-    steps: tuple[int, int, int],
+    field: Field, integrator: Splitting, problem: Qubo | WeightedMaxSat, start: Start, steps: Steps
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
+    machine: Any = field.build(problem)
+    pull_scale = machine.pull_scale if isinstance(machine, BondMachine) else torch.ones(())
+    scalars = [_array(x).reshape(-1) for x in (field.stability(machine), pull_scale)]
+    constants, control = _settings(field, integrator, *scalars)
     n_problems, n_restarts, n = start.voltage.shape
     n_blocks, lanes_each = _blocks(n_restarts)
     sparse = _sparse(machine, problem, n_problems)
     voltage = _to_lanes(_array(start.voltage), n_blocks, lanes_each)
     sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
-    memories = [
-        _to_lanes(memory, n_blocks, lanes_each)
-        for memory in _memories([(n_problems, n_restarts, size) for size in sizes], start.kept)
-    ]
+    kept = [_array(memory) for memory in start.kept]
+    kept = kept or [np.zeros((n_problems, n_restarts, size), np.float32) for size in sizes]
+    memories = [_to_lanes(memory, n_blocks, lanes_each) for memory in kept]
     seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks, lanes_each)[:, :, 0])
     out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
@@ -170,18 +230,20 @@ def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
     return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
 
 
-def _constants(field: ClauseField | BondField, machine: Machine, n_problems: int) -> Array:
-    """Constants of the field in the order in which the kernels read them, ``(n_problems, 10)``."""
+def _settings(field: Field, integrator: Splitting, stability: Array, pull_scale: Array) -> tuple[Array, Array]:
+    """Constants of the field and of the steps in the order in which the kernels read them, a row a problem."""
     if isinstance(field, BondField):
         values = [field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta]
         values += [field.short_term_min, field.long_term_max, field.short_term_start, 1.0]
     else:
         values = [field.alpha, field.beta, field.gamma, field.delta, field.epsilon, field.zeta]
         values += [field.long_term_max, field.unit_pull, 0.0, 1.0]
-    constants = np.tile(np.array(values, np.float32), (n_problems, 1))
-    if isinstance(machine, BondMachine):
-        constants[:, 9] = _array(machine.pull_scale).reshape(-1)
-    return constants
+    constants = np.tile(np.array(values, np.float32), (len(stability), 1))
+    constants[:, 9] = pull_scale
+    limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
+    control = np.tile(np.array(limits, np.float32), (len(stability), 1))
+    control[:, 0] *= stability
+    return constants, control
 
 
 def _digital(*parts: Tensor) -> tuple[Array, ...]:
@@ -201,39 +263,36 @@ def _seeds(seed: Tensor) -> Array:
     return seed.numpy().astype(np.uint64)
 
 
-def _memories(shapes: Any, kept: tuple[Tensor, ...]) -> list[Array]:
-    """Long-term memories: as kept, or at rest."""
-    if kept:
-        return [_array(memory).copy() for memory in kept]
-    return [np.zeros(shape, np.float32) for shape in shapes]
-
-
-def _outputs(restarts: tuple[int, ...], n: int, steps: tuple[int, int, int]) -> tuple[Array, ...]:
-    """Best assignment, its step, record times and states."""
+def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Array, ...]:
+    """Best assignment, its step, the last step, record times and states."""
     n_records = steps[0] // steps[2] if steps[2] else 0
     return (
         np.empty((*restarts, n), np.float32),
+        np.empty(restarts, np.int64),
         np.empty(restarts, np.int64),
         np.empty((*restarts, n_records)),
         np.empty((*restarts, n_records, n), np.bool_),
     )
 
 
-def _finish(out: tuple[Array, ...], voltage: Array, memories: list[Array], steps: tuple[int, int, int]) -> Run:
-    best, found_at, times, states = (torch.from_numpy(np.ascontiguousarray(x)) for x in out)
+def _finish(out: tuple[Array, ...], voltage: Array, memories: list[Array], steps: Steps) -> Run:
+    best, found_at, last, times, states = (torch.from_numpy(np.ascontiguousarray(x)) for x in out)
     kept = tuple(torch.from_numpy(memory) for memory in memories)
     visited = Visited(times, states) if steps[2] else None
-    return Run(best > 0.5, found_at, torch.from_numpy(voltage), kept, visited)
+    return Run(best > 0.5, found_at, last, torch.from_numpy(voltage), kept, visited)
 
 
 def _blocks(n_restarts: int) -> tuple[int, int]:
-    """Number of blocks of restarts and lanes of each, a multiple of the vector width up to ``_MOST_LANES``."""
+    """Number of blocks of restarts and lanes of each, a multiple of ``_LANES`` up to ``_MOST_LANES``."""
     n_blocks = -(-n_restarts // _MOST_LANES)
-    return n_blocks, -(-n_restarts // (n_blocks * _VECTOR)) * _VECTOR
+    return n_blocks, -(-n_restarts // (n_blocks * _LANES)) * _LANES
 
 
-_VECTOR = 16
-"""float32 numbers in the longest vector register of present processors."""
+_VECTOR = 8
+"""float32 numbers in a vector register; layers are padded to a multiple."""
+
+_LANES = 16
+"""Blocks of restarts are padded to a multiple."""
 
 _MOST_LANES = 32
 """Enough to hide the cost of a loop over the lanes, few enough to keep a variable's numbers close together."""

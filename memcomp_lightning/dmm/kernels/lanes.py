@@ -14,7 +14,17 @@ import math
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.dmm.kernels.common import BOND, F32, FAST_MATH, MAX_SWEEPS, REFRESH, uniform
+from memcomp_lightning.dmm.kernels.common import (
+    BOND,
+    F32,
+    FAST_MATH,
+    MAX_SWEEPS,
+    REFRESH,
+    TINY,
+    clause,
+    clause_rates,
+    uniform,
+)
 
 U64 = np.uint64
 
@@ -25,31 +35,18 @@ def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
 
     ``memory`` holds x_s + epsilon and x_l - 1 of each pair, ``(n_pairs, 2, lanes)``; ``push`` is scratch.
     """
-    zero, half, one = F32(0), F32(0.5), F32(1)
-    alpha, beta, gamma, delta, epsilon, zeta, cap = c[0], c[1], c[2], c[3], c[4], c[5], c[6] - one
-    top, stiff = one + epsilon, one + zeta
-    lanes = U64(dt.size)
+    half, lanes = F32(0.5), U64(dt.size)
     m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
     for e in range(weight.size):
-        w = weight[e]
-        first, second = polarity[e, 0], polarity[e, 1]
+        w, second = math.copysign(weight[e], polarity[e, 0]), polarity[e, 1]
         a, b, short = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, U64(2 * e) * lanes
         long = short + lanes
         for k in range(lanes):
-            false_first, false_second = half - half * first * v[a + k], half - half * second * v[b + k]
-            unsatisfied = min(false_first, false_second)
-            s = min(top, max(epsilon, m[short + k] * (one + dt[k] * beta * (unsatisfied - gamma))))
-            x = m[long + k]
-            excess = dt[k] * alpha * (unsatisfied - delta)
-            x = min(cap, max(F32(0), x + excess * (one if excess > zero else x)))
-            m[short + k] = s
-            m[long + k] = x
-            agile = w * (s - epsilon)
-            gradient = agile + agile * x
-            rigidity = (w - agile) * unsatisfied * (stiff + zeta * x)
-            at_first = rigidity if false_first <= false_second else zero
-            push[k] = first * (gradient * false_second + at_first)
-            push[lanes + k] = second * (gradient * false_first + (rigidity - at_first))
+            m[short + k], m[long + k], at_first, at_second = clause(
+                w, v[a + k], half - half * second * v[b + k], m[short + k], m[long + k], clause_rates(c, dt[k])
+            )
+            push[k] = at_first
+            push[lanes + k] = second * at_second
         a, b = a + a, b + b
         for k in range(lanes):
             r[a + k] += push[k]
@@ -96,7 +93,7 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
 def longer_pass(variables, polarity, weight, memory, voltage, rate, falsehood, c, dt):
     """The same for clauses of three literals and more, padded with polarity 0; ``falsehood`` is scratch."""
     zero, half, one = F32(0), F32(0.5), F32(1)
-    alpha, beta, gamma, delta, epsilon, zeta, cap = c[0], c[1], c[2], c[3], c[4], c[5], c[6] - one
+    alpha, beta, gamma, delta, epsilon, cap = c[0], c[1], c[2], c[3], c[4], c[6] - one
     lanes = dt.size
     for e in range(weight.size):
         w = weight[e]
@@ -123,7 +120,7 @@ def longer_pass(variables, polarity, weight, memory, voltage, rate, falsehood, c
             memory[e, 1, k] = x
             agile = w * (s - epsilon)
             gradient = agile + agile * x
-            rigidity = (w - agile) * smallest * (one + zeta + zeta * x)
+            rigidity = (w - agile) * smallest
             for i in range(length):
                 push = gradient * next_smallest + rigidity if i == at else gradient * smallest
                 rate[variables[e, i], 0, k] += polarity[e, i] * push
@@ -217,22 +214,22 @@ def local_fields(digital, linear, pairs, x, field, true, energy):
     for i in range(n):
         for k in range(lanes):
             energy[k] += half * y[i * lanes + k] * (linear[i] + f[i * lanes + k])
-    for clause in range(weight.size):
+    for at in range(weight.size):
         for k in range(x.shape[1]):
             count = 0
             for j in range(variables.shape[1]):
-                sign = polarity[clause, j]
-                if sign != 0 and (sign > 0) == (x[variables[clause, j], k] > half):
+                sign = polarity[at, j]
+                if sign != 0 and (sign > 0) == (x[variables[at, j], k] > half):
                     count += 1
-            true[clause, k] = count
+            true[at, k] = count
             if count == 0:
-                energy[k] += weight[clause]
+                energy[k] += weight[at]
             for j in range(variables.shape[1]):
-                sign = polarity[clause, j]
+                sign = polarity[at, j]
                 if sign != 0:
-                    holds = 1 if (sign > 0) == (x[variables[clause, j], k] > half) else 0
+                    holds = 1 if (sign > 0) == (x[variables[at, j], k] > half) else 0
                     if count == holds:
-                        field[variables[clause, j], k] -= sign * weight[clause]
+                        field[variables[at, j], k] -= sign * weight[at]
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -301,7 +298,7 @@ def keep_best(x, energy, lowest, found_at, best, step):
 
 
 @njit(nogil=True, cache=True)
-def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, times, states):
+def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, last, times, states):
     """Integrate the blocks of restarts numbered ``begin`` to ``end - 1``, problem by problem.
 
     Args:
@@ -310,11 +307,12 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         stop: One number; anything but 0 ends the integration at the next step.
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
-        control: (max_change, dt_min, dt_max, noise), a problem each.
+        control: (change, dt_min, dt_max, noise, lag), a problem each.
         start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed.
-        steps: (n_steps, quench_every, record_every), 0 for never.
+        steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
         best: Out, ``(n_problems, n_blocks, lanes, n)``.
-        found_at: Out, ``(n_problems, n_blocks, lanes)``.
+        found_at: Out, the step at which it was met, ``(n_problems, n_blocks, lanes)``; 0 for the initial state.
+        last: Out, the number of steps done, likewise.
         times: Out, ``(n_problems, n_blocks, lanes, n_records)``.
         states: Out, ``(n_problems, n_blocks, lanes, n_records, n)``.
     """
@@ -327,7 +325,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         if stop[0] != 0:
             return
         p, b = item // n_blocks, item % n_blocks
-        found_at[p, b] = integrate(
+        found_at[p, b], last[p, b] = integrate(
             (kind, pairs, weight[p], polarity[p], unit[p], variables, longer_polarity, longer_weight[p]),
             (
                 offsets,
@@ -354,7 +352,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
 def integrate(problem, digital, linear, c, control, start, steps, stop, best, times, states):
-    """Integrate the lanes of a block; return the step at which each one's ``best`` was met, 0 for the start.
+    """Integrate the lanes of a block; return the step at which each one's ``best`` was met, and its last step.
 
     Args:
         problem: (kind, pairs, weight or bond, polarity, unit or field, variables, polarity and weight of the
@@ -362,10 +360,11 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         digital: What ``flip`` needs.
         linear: ``(n,)``, of the energy.
         c: Constants of the field, in the order of ``cpu._constants``.
-        control: (max_change, dt_min, dt_max, noise), a problem each.
+        control: (change, dt_min, dt_max, noise, lag), a problem each.
         start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
-        steps: (n_steps, quench_every, record_every); quench_every = 0 reads each step without a quench.
+        steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
+            quench. A restart rests from the first reading at or after step min_steps + stall found_at.
         stop: One number; anything but 0 ends the integration.
         best: ``(lanes, n)``, out: the assignments of lowest energy.
         times: ``(lanes, n_records)``, out.
@@ -373,7 +372,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     """
     kind, pairs, weight, polarity, unit, longer_variables, longer_polarity, longer_weight = problem
     voltage, long, unit_long, longer_long, seeds = start
-    n_steps, quench_every, every = steps
+    n_steps, quench_every, every, min_steps, stall = steps
     half, one = F32(0.5), F32(1)
     n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
     rate, push = np.zeros((n, 2, lanes), F32), np.empty(2 * lanes, F32)
@@ -399,11 +398,13 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     tried, tried_field, tried_true = np.empty_like(x), np.empty_like(field), np.empty_like(true)
     energy, reached = np.zeros(lanes), np.zeros(lanes)
     lowest, found_at = np.full(lanes, 1e300), np.zeros(lanes, np.int64)
-    elapsed, dt, fastest = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
+    elapsed, dt, size = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
+    before = np.zeros((n, lanes), F32)
     for i in range(n):
         for k in range(lanes):
             x[i, k] = one if voltage[i, k] > 0 else F32(0)
     local_fields(digital, linear, pairs, x, field, true, energy)
+    last, n_running = np.full(lanes, n_steps), lanes
     n_changed, n_reads, counter = 1, 0, U64(0)
     for step in range(n_steps + 1):
         recorded = every > 0 and step > 0 and step % every == 0
@@ -439,14 +440,26 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
             longer_pass(
                 longer_variables, longer_polarity, longer_weight, longer_memory, voltage, rate, falsehood, c, dt
             )
-        if step == n_steps or stop[0] != 0:
+        if reads:
+            for k in range(lanes):
+                if last[k] == n_steps and step < n_steps and step >= min_steps + stall * found_at[k]:
+                    last[k] = step
+                    n_running -= 1
+        if step == n_steps or stop[0] != 0 or n_running == 0:
             break
-        fastest[:] = F32(1e-30)
+        lag = control[4] if step > 0 else F32(0)
+        size[:] = 0
         for i in range(n):
             for k in range(lanes):
-                fastest[k] = max(fastest[k], abs(rate[i, 0, k]))
+                now = rate[i, 0, k]
+                rate[i, 0, k] += lag * (before[i, k] - now)
+                before[i, k] = now
+            for k in range(lanes):
+                size[k] += rate[i, 0, k] * rate[i, 0, k]
         for k in range(lanes):
-            dt[k] = min(control[2], max(control[1], control[0] / fastest[k]))
+            # A step of size 0 leaves voltages and memories where they are.
+            change = control[0] / max(F32(math.sqrt(size[k] / F32(n))), TINY)
+            dt[k] = min(control[2], max(control[1], change)) if last[k] == n_steps else F32(0)
             elapsed[k] += dt[k]
         for i in range(n):
             for k in range(lanes):
@@ -465,4 +478,4 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     for e in range(n_longer):
         for k in range(lanes):
             longer_long[e, k] = longer_memory[e, 1, k]
-    return found_at
+    return found_at, last

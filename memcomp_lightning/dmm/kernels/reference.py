@@ -7,7 +7,7 @@ from torch import Tensor
 
 from memcomp_lightning.dmm.base import Recording, VectorField
 from memcomp_lightning.dmm.integrate import Integrator, Shake, still
-from memcomp_lightning.dmm.kernels.run import Run, Start, Visited
+from memcomp_lightning.dmm.kernels.run import Run, Stall, Start, Visited
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat
 from memcomp_lightning.qubo.qubo import Qubo
 
@@ -24,6 +24,8 @@ def run(
     n_steps: int,
     quench_every: int,
     recording: Recording | None,
+    stall: Stall | None = None,
+    remember: bool = True,
 ) -> Run:
     """Integrate for ``n_steps`` steps and keep the best assignment met.
 
@@ -35,20 +37,28 @@ def run(
         n_steps: Steps a restart.
         quench_every: Read the digital state each so many steps, and descend from a copy of it by single flips; 0
             reads it at each step, without a descent.
-        recording: Which records to keep.
+        recording: Which records to keep; a recorded restart does not stall.
+        stall: When a restart ends before ``n_steps``; None lets all run to the end.
+        remember: Whether to return the long-term memories.
     """
+    stall = None if recording is not None else stall
     machine = field.build(problem)
     state = _warmed(field.init(machine, start.voltage), start.kept)
     best = state.voltage > 0
     best_energy = problem.energy(best)
     found_at = torch.zeros(best_energy.shape, dtype=torch.int64, device=best.device)
+    running = torch.ones_like(found_at, dtype=torch.bool)
+    steps = torch.zeros_like(found_at)
     time = torch.zeros_like(best_energy)
+    before: Tensor | None = None
     times: list[Tensor] = []
     states: list[Tensor] = []
     for step in range(n_steps + 1):
         if step > 0:
-            state, dt = integrator.step(field, machine, state, _shake(field.noise, start.seed, step - 1))
-            time = time + dt
+            shake = _shake(field.noise, start.seed, step - 1)
+            moved, dt, before = integrator.step(field, machine, state, before=before, shake=shake)
+            state = moved if stall is None else _where(running, moved, state)
+            steps, time = steps + running.long(), time + dt
         x = state.voltage > 0
         if quench_every == 0 or step % quench_every == 0:
             # A descent ends at or below its start: its end alone need be compared.
@@ -58,11 +68,15 @@ def run(
             best = torch.where(better.unsqueeze(-1), candidate, best)
             best_energy = torch.minimum(energy, best_energy)
             found_at = torch.where(better, step, found_at)
+            if stall is not None:
+                running &= step < stall.min_steps + stall.factor * found_at
+                if not running.any():
+                    break
         if recording is not None and step > 0 and step % recording.every == 0:
             times.append(time)
             states.append(x)
     visited = Visited(torch.stack(times, dim=-1), torch.stack(states, dim=-2)) if times else None
-    return Run(best, found_at, state.voltage, _long_term(state), visited)
+    return Run(best, found_at, steps, state.voltage, _long_term(state) if remember else (), visited)
 
 
 def quench(problem: Qubo | WeightedMaxSat, x: Tensor) -> Tensor:
@@ -110,6 +124,16 @@ def _shake(noise: float, seed: Tensor, step: int) -> Shake:
         return state._replace(voltage=state.voltage + noise * dt.sqrt().unsqueeze(-1) * kick)
 
     return shake
+
+
+def _where(running: Tensor, moved: Any, state: Any) -> Any:
+    """The restarts that are running have moved, the others have not."""
+    return type(state)(
+        *(
+            torch.where(running.reshape(*running.shape, *(1,) * (new.ndim - running.ndim)), new, old)
+            for new, old in zip(moved, state, strict=True)
+        )
+    )
 
 
 def _warmed(state: Any, kept: tuple[Tensor, ...]) -> Any:

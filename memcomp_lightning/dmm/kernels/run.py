@@ -32,19 +32,35 @@ class Start(NamedTuple):
     seed: Tensor
 
 
+class Stall(NamedTuple):
+    """When a restart has gone long enough without a better assignment.
+
+    It ends at the first reading at or after step ``min_steps + factor found_at``.
+
+    Attributes:
+        min_steps: Steps that a restart gets in any case.
+        factor: Steps that it gets for each step that its best assignment took.
+    """
+
+    min_steps: int
+    factor: float
+
+
 class Run(NamedTuple):
     """Outcome of one run of all restarts.
 
     Attributes:
         best: Best assignment a restart, ``(n_problems, n_restarts, n)`` bool.
         found_at: Step at which it was met, ``(n_problems, n_restarts)`` int64; 0 is the start.
+        steps: Steps done, likewise.
         voltage: Final voltages.
-        kept: Final long-term memories less 1, for a warm restart.
+        kept: Final long-term memories less 1, for a warm restart; empty if not asked for.
         visited: The records, if asked for.
     """
 
     best: Tensor
     found_at: Tensor
+    steps: Tensor
     voltage: Tensor
     kept: tuple[Tensor, ...]
     visited: Visited | None
