@@ -6,19 +6,20 @@ two-literal form as in public research code of the same group. Constants: docs/d
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.scaling import (
+    DEGREE_EXPONENT,
     by_largest,
     collective_mode,
     coupling_norm,
     decisive,
+    effective_degree,
     expand,
-    n_coupled,
     step_scale,
 )
 from memcomp_lightning.errors import require
@@ -30,7 +31,8 @@ from memcomp_lightning.qubo.qubo import Qubo
 class ClauseMachine(NamedTuple):
     """A problem in the machine's units; per-clause tensors have an axis of size 1 for the restarts.
 
-    Clauses of three literals and more are padded to the longest one with polarity 0.
+    Clauses of three literals and more are padded to the longest one with polarity 0. ``degree`` is the
+    effective one, ``(*problems,)``.
     """
 
     graph: Graph
@@ -43,6 +45,7 @@ class ClauseMachine(NamedTuple):
     longer_polarity: Tensor
     longer_weight: Tensor
     stability: Tensor
+    degree: Tensor
 
 
 class ClauseState(NamedTuple):
@@ -68,11 +71,11 @@ class ClauseField:
         G_i &= q_i \min_{j \ne i} f_j, \qquad R_i = q_i C \text{ where } f_i = C \text{, else } 0 \\
         \dot x_s &= \beta (x_s + \epsilon)(C - \gamma), \quad x_s \in [0, 1] \\
         \dot x_l &= \alpha (C - \delta) \cdot (x_l - 1 \text{ if } C < \delta \text{ else } 1),
-                    \quad x_l \in [1, x_{max}]
+                    \quad x_l \in [1, 1 + (x_{max} - 1) d^{-0.17}]
 
     and y, the long-term memory of a unit clause of signed weight u, like x_l. Weights are divided by
     :func:`~memcomp_lightning.dmm.scaling.coupling_norm`, so that the drive of a voltage does not depend on the
-    problem's units, size and degrees.
+    problem's units, size and degrees; d is its :func:`~memcomp_lightning.dmm.scaling.effective_degree`.
 
     Attributes:
         alpha: Rate of the long-term memory, > 0.
@@ -81,25 +84,25 @@ class ClauseField:
         delta: Threshold of the long-term memory, in (0, gamma].
         epsilon: Keeps the short-term memory from sticking at 0, > 0.
         zeta: Share of the long-term memory in the rigidity, >= 0.
-        long_term_max: Upper bound of the long-term memories, >= 1; 1 freezes them.
+        long_term_max: x_max, upper bound of the long-term memories at degree 1, >= 1; 1 freezes them.
         unit_pull: rho, strength of the unit clauses, > 0.
         noise: Width of the uniform noise on the voltages per square root of machine time, >= 0.
         spread: Initial voltages are uniform in [-spread, spread], in (0, 1].
         integrator: The scheme that the constants were chosen with.
     """
 
-    alpha: float = 25.0
-    beta: float = 0.14
-    gamma: float = 0.021
-    delta: float = 0.0139
-    epsilon: float = 0.47
+    alpha: float = 14.0
+    beta: float = 0.15
+    gamma: float = 0.036
+    delta: float = 0.024
+    epsilon: float = 0.66
     zeta: float = 0.0
-    long_term_max: float = 6.4
+    long_term_max: float = 9.5
     unit_pull: float = 1.0
     noise: float = 0.0
-    spread: float = 0.4
+    spread: float = 0.5
     integrator: Integrator = field(
-        default_factory=lambda: Splitting(change=1.0, dt_min=0.0126, dt_max=6.0, lag=0.28)
+        default_factory=lambda: Splitting(change=0.95, dt_min=0.0126, dt_max=6.0, lag=0.33)
     )
 
     def __post_init__(self) -> None:
@@ -111,6 +114,10 @@ class ClauseField:
             require(getattr(self, name) >= 0, name, getattr(self, name), "a number >= 0")
         require(self.long_term_max >= 1, "long_term_max", self.long_term_max, "a number >= 1")
         require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
+
+    def most_long_term(self, degree: Any) -> Any:
+        """Upper bound of the long-term memories at an effective degree, a tensor or an array."""
+        return 1 + (self.long_term_max - 1) * degree**-DEGREE_EXPONENT
 
     def build(self, problem: Qubo | WeightedMaxSat) -> ClauseMachine:
         """Write a QUBO as MAX-SAT and divide the weights by their scale."""
@@ -125,13 +132,18 @@ class ClauseField:
         longer_weight = flat[..., n_pairs:]
         scale = coupling_norm(maxsat.graph, weight)
         if maxsat.longer:
-            scale = torch.where((flat[..., :n_pairs] == 0).all(-1), _clause_norm(longer, longer_weight), scale)
+            power = _per_variable(longer, longer_weight.square(), maxsat.n)
+            norm = (power.sum(-1) / (power > 0).sum(-1).clamp(min=1)).sqrt()
+            alone = (flat[..., :n_pairs] == 0).all(-1) & (norm > 0)
+            scale = torch.where(alone, norm, scale)
         weight, unit = weight / expand(scale, n_axes), unit / scale.unsqueeze(-1)
         if not maxsat.longer:
             unit = decisive(maxsat.graph, weight, unit)
-        n_used = n_coupled(maxsat.graph, weight)
-        if maxsat.longer:
-            n_used = torch.maximum(n_used, _n_in_clauses(longer, longer_weight))
+        longer_weight = longer_weight / scale.unsqueeze(-1)
+        size, power = (
+            maxsat.graph.scatter(of_pairs, of_pairs) + _per_variable(longer, of_longer, maxsat.n)
+            for of_pairs, of_longer in ((weight, longer_weight), (weight.square(), longer_weight.square()))
+        )
         collective = collective_mode(maxsat.graph, weight * maxsat.first * maxsat.second)
         return ClauseMachine(
             graph=maxsat.graph,
@@ -142,8 +154,9 @@ class ClauseField:
             unit_sign=unit.sign().unsqueeze(-2),
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
-            longer_weight=(longer_weight / scale.unsqueeze(-1)).unsqueeze(-2),
-            stability=step_scale(maxsat.n, n_used, collective).unsqueeze(-1),
+            longer_weight=longer_weight.unsqueeze(-2),
+            stability=step_scale(maxsat.n, (size > 0).sum(-1), collective).unsqueeze(-1),
+            degree=effective_degree(size, power),
         )
 
     def stability(self, machine: ClauseMachine) -> Tensor:
@@ -231,14 +244,19 @@ class ClauseField:
         }
 
     def bound(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
-        """V in [-1, 1], x_s in [0, 1], long-term memories in [1, long_term_max]."""
+        """V in [-1, 1], x_s in [0, 1], long-term memories in [1, :meth:`most_long_term`]."""
+
+        def bounded(memory: Tensor) -> Tensor:
+            most = self.most_long_term(machine.degree)
+            return torch.minimum(memory.clamp(min=1), expand(most, memory.ndim - most.ndim))
+
         return ClauseState(
             voltage=state.voltage.clamp(-1, 1),
             short_term=state.short_term.clamp(0, 1),
-            long_term=state.long_term.clamp(1, self.long_term_max),
-            unit_long_term=state.unit_long_term.clamp(1, self.long_term_max),
+            long_term=bounded(state.long_term),
+            unit_long_term=bounded(state.unit_long_term),
             longer_short_term=state.longer_short_term.clamp(0, 1),
-            longer_long_term=state.longer_long_term.clamp(1, self.long_term_max),
+            longer_long_term=bounded(state.longer_long_term),
         )
 
 
@@ -275,21 +293,8 @@ def _padded(maxsat: WeightedMaxSat) -> Clauses:
     )
 
 
-def _clause_power(clauses: Clauses, weight: Tensor) -> Tensor:
-    """Sum of the squared weights of each variable's clauses, ``(*problems, n)`` for the variables that occur."""
-    n = int(clauses.variables.max()) + 1 if clauses.variables.numel() else 1
-    power = weight.new_zeros(*weight.shape[:-1], n)
-    per_literal = weight.square().unsqueeze(-1) * (clauses.polarity != 0)
-    return power.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))
-
-
-def _n_in_clauses(clauses: Clauses, weight: Tensor) -> Tensor:
-    """Number of variables in clauses with a weight."""
-    return (_clause_power(clauses, (weight != 0).to(weight.dtype)) > 0).sum(-1)
-
-
-def _clause_norm(clauses: Clauses, weight: Tensor) -> Tensor:
-    """The scale where there are no pairs: root mean square over the variables of their clauses' weights."""
-    power = _clause_power(clauses, weight)
-    norm = (power.sum(-1) / (power > 0).sum(-1).clamp(min=1)).sqrt()
-    return torch.where(norm > 0, norm, torch.ones_like(norm))
+def _per_variable(clauses: Clauses, values: Tensor, n: int) -> Tensor:
+    """Sum of a number a clause over the clauses of each variable, ``(*problems, n)``."""
+    total = values.new_zeros(*values.shape[:-1], n)
+    per_literal = values.unsqueeze(-1) * (clauses.polarity != 0)
+    return total.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))

@@ -38,10 +38,22 @@ def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
     return torch.where(norm > SMALLEST_RATIO, norm, torch.ones_like(norm))
 
 
-def n_coupled(graph: Graph, coupling: Tensor) -> Tensor:
-    """Number of variables with a coupling that is not 0, ``(*problems,)``."""
-    used = (coupling != 0).to(coupling.dtype)
-    return (graph.scatter(used, used) > 0).sum(-1)
+def effective_degree(size: Tensor, power: Tensor) -> Tensor:
+    r"""Mean over the coupled variables of ``(\sum_j |w_ij|)^2 / \sum_j w_ij^2``, ``(*problems,)``.
+
+    The number of couplings of a variable if all are alike, fewer if some are stronger. At least 1.
+
+    Args:
+        size: ``\sum_j |w_ij|`` of each variable, ``(*problems, n)``.
+        power: ``\sum_j w_ij^2``, likewise.
+    """
+    used = power > 0
+    degree = torch.where(used, size.square() / torch.where(used, power, 1), 0)
+    return (degree.sum(-1) / used.sum(-1).clamp(min=1)).clamp(min=1)
+
+
+DEGREE_EXPONENT = 0.17
+"""How the best bound of the long-term memories, less 1, falls with the effective degree."""
 
 
 def step_scale(n: int, n_coupled: Tensor, collective: Tensor) -> Tensor:

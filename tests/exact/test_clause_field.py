@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import AdaptiveEuler, ClauseField
+from memcomp_lightning.dmm import AdaptiveEuler, ClauseField, Splitting
 from memcomp_lightning.dmm.clause import ClauseState
+from memcomp_lightning.dmm.scaling import DEGREE_EXPONENT, SIZE_EXPONENT
 from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo
 from memcomp_lightning.qubo.maxsat import Clauses
 from memcomp_lightning.testing.conformance import small_rbm
@@ -258,7 +259,8 @@ def test_bounds_are_reached_and_never_crossed():
     integrator = AdaptiveEuler(change=2.35, dt_min=0.0126, dt_max=2.8)
     machine = field.build(from_model(small_rbm(11, 7).double()))
     state = field.init(machine, uniform(5, 18, low=-1, high=1, seed=0))
-    reached = {"short": False, "long": False}
+    reached, most = {"short": False, "long": False}, field.most_long_term(machine.degree)
+    assert 1 < most < 3.3
     for _ in range(211):
         state, _, _ = integrator.step(field, machine, state)
         assert state.voltage.abs().max() <= 1
@@ -266,9 +268,9 @@ def test_bounds_are_reached_and_never_crossed():
         assert state.short_term.max() <= 1
         for memory in (state.long_term, state.unit_long_term):
             assert memory.min() >= 1
-            assert memory.max() <= 3.3
+            assert memory.max() <= most
         reached["short"] |= bool((state.short_term == 0).any())
-        reached["long"] |= bool((state.long_term == 3.3).any())
+        reached["long"] |= bool((state.long_term == most).any())
     assert all(reached.values())
 
 
@@ -277,6 +279,26 @@ def test_bounds_are_reached_and_never_crossed():
 
 def derivative_of(maxsat, state, field=OTHER):
     return field.derivative(field.build(maxsat), state)
+
+
+@pytest.mark.parametrize("longer", [False, True], ids=["pairs", "longer clauses"])
+def test_variables_without_couplings_do_not_change_the_steps(longer):
+    """Their rates are 0: the root mean square over more variables is smaller, the factor makes up for it."""
+    maxsat = random_maxsat(SPARSE, longer=longer)
+    n = SPARSE.n
+    more = dataclasses.replace(
+        maxsat,
+        graph=dataclasses.replace(SPARSE, n=n + 40),
+        unit=torch.nn.functional.pad(maxsat.unit, (0, 40)),
+    )
+    steps = []
+    for problem in (maxsat, more):
+        machine = OTHER.build(problem)
+        voltage = uniform(5, n, low=-1, high=1, seed=0)
+        state = OTHER.init(machine, torch.nn.functional.pad(voltage, (0, problem.n - n)))
+        rate = OTHER.derivative(machine, state).voltage
+        steps.append(Splitting(dt_min=1e-9, dt_max=1e9).step_size(rate, OTHER.stability(machine)))
+    torch.testing.assert_close(*steps, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("longer", [False, True], ids=["pairs", "longer clauses"])
@@ -419,11 +441,13 @@ def test_a_huge_unit_clause_is_limited_to_what_decides_its_variable(size):
 
 
 def test_steps_are_as_long_as_independent_couplings_allow():
-    """1 on random couplings; 2 norm / eigenvalue where all variables pull alike."""
-    random = Qubo.from_matrix(normal(13, 13, seed=1))
-    assert OTHER.stability(OTHER.build(random)).tolist() == [1.0]
+    """By the size of the problem alone on random couplings; times 2 norm / eigenvalue where all pull alike."""
+    for n in (13, 53):
+        random = Qubo.from_matrix(normal(n, n, seed=1))
+        by_size = (n / 200) ** -SIZE_EXPONENT
+        assert OTHER.stability(OTHER.build(random)).item() == pytest.approx(by_size, rel=1e-6)
     alike = Qubo.from_matrix(torch.ones(13, 13).double().triu(1))
-    expected = 2 * math.sqrt(12) / 12
+    expected = 2 * math.sqrt(12) / 12 * (13 / 200) ** -SIZE_EXPONENT
     assert OTHER.stability(OTHER.build(alike)).item() == pytest.approx(expected, rel=1e-3)
     both = Qubo(
         alike.graph,
@@ -434,3 +458,59 @@ def test_steps_are_as_long_as_independent_couplings_allow():
     torch.testing.assert_close(
         OTHER.stability(OTHER.build(both)), torch.full((2, 1), expected).double(), rtol=1e-3, atol=0
     )
+
+
+# --- degree -----------------------------------------------------------------------------------------------
+
+
+def ring(n, weights=(1.0, 1.0), n_isolated=0):
+    """Each variable has two neighbours."""
+    first = torch.arange(n)
+    values = torch.tensor(weights, dtype=torch.float64)[first % 2]
+    return Qubo.from_coo(n + n_isolated, first, (first + 1) % n, values)
+
+
+@pytest.mark.parametrize(
+    ("qubo", "degree"),
+    [
+        (ring(8), 2.0),
+        (ring(8, n_isolated=5), 2.0),
+        (ring(8, weights=(-1e30, 1e30)), 2.0),
+        (ring(8, weights=(1.0, 0.5)), 1.5**2 / 1.25),
+        (ring(8, weights=(1.0, 0.0)), 1.0),
+        (Qubo.from_matrix(torch.ones(13, 13).double().triu(1)), 12.0),
+        (
+            Qubo(Bipartite(3, 5), torch.ones(5, 3).double(), torch.zeros(8).double(), torch.zeros(())),
+            (3 * 5 + 5 * 3) / 8,
+        ),
+        (Qubo.from_matrix(torch.diag(torch.ones(3)).double()), 1.0),
+    ],
+    ids=["ring", "isolated", "huge", "uneven", "zeros", "complete", "layers", "no couplings"],
+)
+def test_effective_degree_counts_couplings_by_their_strength(qubo, degree):
+    assert OTHER.build(qubo).degree.item() == pytest.approx(degree, rel=1e-6)
+
+
+def test_effective_degree_counts_longer_clauses():
+    """Variable 1 is in three clauses, 2 to 7 in one each."""
+    clauses = [[1, 2], [1, 3, 4], [-1, 5, 6, 7]]
+    problem = WeightedMaxSat.from_clauses(8, clauses, [1.0, 1.0, 1.0])
+    assert OTHER.build(problem).degree.item() == pytest.approx((3 + 6 * 1) / 7)
+
+
+@pytest.mark.parametrize("largest", [1.0, 5.0])
+def test_long_term_memories_are_bounded_more_tightly_where_degrees_are_high(largest):
+    field = dataclasses.replace(OTHER, long_term_max=largest)
+    state = random_state(random_maxsat(SPARSE, longer=True), 5, 9.0)
+    bounds = []
+    for weight in (0.0, 1.0):
+        maxsat = random_maxsat(SPARSE, longer=True)
+        maxsat = dataclasses.replace(maxsat, weight=torch.cat((maxsat.weight[:1], weight * maxsat.weight[1:])))
+        machine = field.build(maxsat)
+        bounded = field.bound(machine, state)
+        bounds.append(bounded.long_term.max().item())
+        assert bounds[-1] == pytest.approx(1 + (largest - 1) * machine.degree.item() ** -DEGREE_EXPONENT)
+        assert bounded.unit_long_term.max() <= bounds[-1]
+        assert bounded.longer_long_term.max() <= bounds[-1]
+    if largest > 1:
+        assert bounds[0] != bounds[1]

@@ -307,8 +307,7 @@ def test_steps_follow_the_stability_of_each_problem(scheme):
     field = ClauseField()
     machine = field.build(qubo)
     stability = field.stability(machine)
-    assert stability[0, 0] < 0.7
-    assert stability[1, 0] == 1
+    assert stability[0, 0] < 0.7 * stability[1, 0]
     state = field.init(machine, normal(2, 5, 13, seed=2).tanh())
     _, dt, _ = scheme(change=0.3, dt_min=1e-9, dt_max=1e9).step(field, machine, state)
     size = field.derivative(machine, state).voltage.square().mean(-1).sqrt()

@@ -66,7 +66,7 @@ def _run_rows(
     n_problems, n_restarts, n = start.voltage.shape
     padded = _prepared(field, problem, graph)
     width, height, n_first, n_second = padded.sizes
-    constants, control = _settings(field, integrator, padded.scalars[:, 0], padded.scalars[:, 1])
+    constants, control = _settings(field, integrator, *padded.scalars.T)
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
     control[:, 0] *= np.sqrt(n / (width + height))
     voltage = _pad(_array(start.voltage), n_first, width, width + height)
@@ -123,7 +123,7 @@ def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
     weight = np.zeros((n_problems, n_second * width), np.float32)
     coupling, transposed = (np.zeros((n_problems, height * width), np.float32) for _ in range(2))
     unit, linear = (np.zeros((n_problems, width + height), np.float32) for _ in range(2))
-    scalars = np.empty((n_problems, 2))
+    scalars = np.empty((n_problems, 3))
     kind = BOND if isinstance(field, BondField) else 1 - BOND
     given = [np.ascontiguousarray(x.detach().double().numpy()) for x in (problem.coupling, problem.linear)]
     _announce(prepare)
@@ -139,9 +139,10 @@ def _run_lanes(
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     machine: Any = field.build(problem)
-    pull_scale = machine.pull_scale if isinstance(machine, BondMachine) else torch.ones(())
-    scalars = [_array(x).reshape(-1) for x in (field.stability(machine), pull_scale)]
-    constants, control = _settings(field, integrator, *scalars)
+    one = torch.ones(())
+    scalars = (machine.pull_scale, one) if isinstance(machine, BondMachine) else (one, machine.degree)
+    flat = [_array(x).reshape(-1) for x in (field.stability(machine), *scalars)]
+    constants, control = _settings(field, integrator, *flat)
     n_problems, n_restarts, n = start.voltage.shape
     n_blocks, lanes_each = _blocks(n_restarts)
     sparse = _sparse(machine, problem, n_problems)
@@ -230,7 +231,9 @@ def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
     return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
 
 
-def _settings(field: Field, integrator: Splitting, stability: Array, pull_scale: Array) -> tuple[Array, Array]:
+def _settings(
+    field: Field, integrator: Splitting, stability: Array, pull_scale: Array, degree: Array
+) -> tuple[Array, Array]:
     """Constants of the field and of the steps in the order in which the kernels read them, a row a problem."""
     if isinstance(field, BondField):
         values = [field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta]
@@ -240,6 +243,8 @@ def _settings(field: Field, integrator: Splitting, stability: Array, pull_scale:
         values += [field.long_term_max, field.unit_pull, 0.0, 1.0]
     constants = np.tile(np.array(values, np.float32), (len(stability), 1))
     constants[:, 9] = pull_scale
+    if isinstance(field, ClauseField):
+        constants[:, 6] = field.most_long_term(degree)
     limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
     control = np.tile(np.array(limits, np.float32), (len(stability), 1))
     control[:, 0] *= stability

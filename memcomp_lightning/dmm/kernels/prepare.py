@@ -26,7 +26,7 @@ def prepare(kind, width, height, coupling, linear, weight, unit, scalars, digita
         weight: Out, ``(n_problems, n_second * width)``: bonds, or clause weights with the sign of the first
             polarity; this and all that follow hold 0 where there is padding.
         unit: Out, ``(n_problems, width + height)``: unit clauses or fields.
-        scalars: Out, ``(n_problems, 2)``: stability, scale of the pull.
+        scalars: Out, ``(n_problems, 3)``: stability, scale of the pull, effective degree.
         digital: Out, coupling over a power of two, ``(n_problems, height * width)``.
         transposed: Out, its transpose.
         fields: Out, linear over the same.
@@ -55,6 +55,7 @@ def prepare(kind, width, height, coupling, linear, weight, unit, scalars, digita
         own[:] = own / largest
         _add_both(scaled * scaled, sums)
         norm, n_coupled = _or_one(math.sqrt(_mean_of_used(sums))), max((sums > 0).sum(), 1)
+        scalars[p, 2] = _effective_degree(scaled, sums)
         scaled[:] = scaled / norm
         own[:] = own / norm
         collective = _collective_mode(scaled)
@@ -123,6 +124,18 @@ def _mean_of_used(sums):
         total += value
         n_used += 1 if value > 0 else 0
     return total / max(n_used, 1)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _effective_degree(matrix, power):
+    """``scaling.effective_degree``."""
+    size, total, n_used = np.empty_like(power), 0.0, 0
+    _add_both(np.abs(matrix), size)
+    for i in range(power.size):
+        if power[i] > 0:
+            total += size[i] * size[i] / power[i]
+            n_used += 1
+    return max(total / max(n_used, 1), 1.0)
 
 
 @njit(nogil=True, cache=True)
