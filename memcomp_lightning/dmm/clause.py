@@ -91,18 +91,18 @@ class ClauseField:
         integrator: The scheme that the constants were chosen with.
     """
 
-    alpha: float = 14.0
-    beta: float = 0.15
-    gamma: float = 0.036
-    delta: float = 0.024
-    epsilon: float = 0.66
+    alpha: float = 13.5
+    beta: float = 0.14
+    gamma: float = 0.031
+    delta: float = 0.028
+    epsilon: float = 0.65
     zeta: float = 0.0
-    long_term_max: float = 9.5
-    unit_pull: float = 1.0
+    long_term_max: float = 10.2
+    unit_pull: float = 0.94
     noise: float = 0.0
     spread: float = 0.5
     integrator: Integrator = field(
-        default_factory=lambda: Splitting(change=0.95, dt_min=0.0126, dt_max=6.0, lag=0.33)
+        default_factory=lambda: Splitting(change=0.9, dt_min=0.0126, dt_max=6.0, lag=0.27)
     )
 
     def __post_init__(self) -> None:

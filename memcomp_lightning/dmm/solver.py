@@ -244,26 +244,25 @@ class _Part(NamedTuple):
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps a restart, by the rule ``3 n^(4/5)`` of the number of variables, at least 50."""
-    return max(50, round(3 * math.pow(problem.n, 0.8)))
+    """Most steps a restart: three for each variable up to 200, then by the rule ``600 (n / 200)^(1/2)``."""
+    return max(50, round(min(3 * problem.n, 600 * math.sqrt(problem.n / 200))))
 
 
 def default_min_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps that each restart gets before it may stall."""
-    return 8
+    """Steps that each restart gets before it may stall: a fifteenth of the most."""
+    return max(10, default_steps(problem) // 15)
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps between two readings: 2 for two coupled layers, else by the rule ``12 n / n_pairs``, at least 4.
+    """Steps between two readings: 1 for two coupled layers, else by the rule ``6 n / n_pairs``, at least 2.
 
-    A step costs as much as the pairs, a descent as much as the variables and its flips, which are cheap where the
-    couplings are a matrix.
+    A step costs as much as the pairs, a descent as much as the variables and its flips.
     """
     if isinstance(problem.graph, Bipartite):
-        return 2
+        return 1
     n_pairs = math.prod(problem.graph.edge_shape)
     n_pairs += 0 if isinstance(problem, Qubo) else sum(len(block.variables) for block in problem.longer)
-    return max(4, round(12 * problem.n / max(n_pairs, 1)))
+    return max(2, round(6 * problem.n / max(n_pairs, 1)))
 
 
 @cache

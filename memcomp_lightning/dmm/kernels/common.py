@@ -70,3 +70,13 @@ def clause(weight, voltage, false_second, short, long, rates):
     first = weight * (gradient * false_second + at_first)
     second = abs(weight) * (gradient * false_first + (rigidity - at_first))
     return short, long, first, second
+
+
+@njit(nogil=True, cache=True)
+def keep_if_new(x, best):
+    """Copy a state; return whether it differs."""
+    new = False
+    for i in range(x.size):
+        new |= best[i] != x[i]
+        best[i] = x[i]
+    return new

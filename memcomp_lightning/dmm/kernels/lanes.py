@@ -23,6 +23,7 @@ from memcomp_lightning.dmm.kernels.common import (
     TINY,
     clause,
     clause_rates,
+    keep_if_new,
     uniform,
 )
 
@@ -161,140 +162,105 @@ def bond_fields(field, short, long, voltage, rate, c, dt):
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def flip(digital, x, field, true, i, k):
-    """Flip variable ``i`` of lane ``k``; return the change of energy.
+def flip(digital, x, field, true, i):
+    """Flip variable ``i`` of one restart; return the change of energy.
 
-    ``true`` counts the true literals of each longer clause.
+    The digital states lie restart by restart, one number a variable: ``x`` and ``field`` of a restart stay close
+    together. ``true`` counts the true literals of each longer clause.
     """
     start, neighbour, edge, coupling, in_clause, clause_of, variables, polarity, weight = digital
     half, one = F32(0.5), F32(1)
-    change = one - F32(2) * x[i, k]
-    gain = change * field[i, k]
-    x[i, k] += change
+    change = one - F32(2) * x[i]
+    gain = change * field[i]
+    x[i] += change
     for at in range(start[i], start[i + 1]):
-        field[neighbour[at], k] += change * coupling[edge[at]]
+        field[neighbour[at]] += change * coupling[edge[at]]
     for at in range(in_clause[i], in_clause[i + 1]):
-        clause = clause_of[at]
-        before = true[clause, k]
+        clause_at = clause_of[at]
+        before = true[clause_at]
         after = before
         for j in range(variables.shape[1]):
-            if variables[clause, j] == i and polarity[clause, j] != 0:
-                after += 1 if (polarity[clause, j] > 0) == (x[i, k] > half) else -1
-        true[clause, k] = after
+            if variables[clause_at, j] == i and polarity[clause_at, j] != 0:
+                after += 1 if (polarity[clause_at, j] > 0) == (x[i] > half) else -1
+        true[clause_at] = after
         for j in range(variables.shape[1]):
-            other, sign = variables[clause, j], polarity[clause, j]
+            other, sign = variables[clause_at, j], polarity[clause_at, j]
             if sign == 0 or other == i:
                 continue
-            holds = 1 if (sign > 0) == (x[other, k] > half) else 0
+            holds = 1 if (sign > 0) == (x[other] > half) else 0
             # A literal decides its clause where no other one is true.
             was, now = before == holds, after == holds
             if was != now:
-                field[other, k] += (-sign if now else sign) * weight[clause]
+                field[other] += (-sign if now else sign) * weight[clause_at]
     return gain
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
-def local_fields(digital, linear, pairs, x, field, true, energy):
-    """Write the local fields and the energies of all lanes from scratch."""
+def local_fields(digital, linear, pairs, x, field, true):
+    """Write the local fields of one restart from scratch; return its energy."""
     coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
-    half = F32(0.5)
-    n, lanes = U64(linear.size), U64(x.shape[1])
-    f, y = field.ravel(), x.ravel()
-    for i in range(n):
-        for k in range(lanes):
-            f[i * lanes + k] = linear[i]
+    half, energy = F32(0.5), 0.0
+    field[:] = linear
     for e in range(coupling.size):
-        w = coupling[e]
-        a, b = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes
-        for k in range(lanes):
-            f[a + k] += w * y[b + k]
-        for k in range(lanes):
-            f[b + k] += w * y[a + k]
-    energy[:] = 0
-    for i in range(n):
-        for k in range(lanes):
-            energy[k] += half * y[i * lanes + k] * (linear[i] + f[i * lanes + k])
+        field[pairs[e, 0]] += coupling[e] * x[pairs[e, 1]]
+        field[pairs[e, 1]] += coupling[e] * x[pairs[e, 0]]
+    for i in range(linear.size):
+        energy += half * x[i] * (linear[i] + field[i])
     for at in range(weight.size):
-        for k in range(x.shape[1]):
-            count = 0
-            for j in range(variables.shape[1]):
-                sign = polarity[at, j]
-                if sign != 0 and (sign > 0) == (x[variables[at, j], k] > half):
-                    count += 1
-            true[at, k] = count
-            if count == 0:
-                energy[k] += weight[at]
-            for j in range(variables.shape[1]):
-                sign = polarity[at, j]
-                if sign != 0:
-                    holds = 1 if (sign > 0) == (x[variables[at, j], k] > half) else 0
-                    if count == holds:
-                        field[variables[at, j], k] -= sign * weight[at]
+        count = 0
+        for j in range(variables.shape[1]):
+            sign = polarity[at, j]
+            if sign != 0 and (sign > 0) == (x[variables[at, j]] > half):
+                count += 1
+        true[at] = count
+        if count == 0:
+            energy += weight[at]
+        for j in range(variables.shape[1]):
+            sign = polarity[at, j]
+            if sign != 0:
+                holds = 1 if (sign > 0) == (x[variables[at, j]] > half) else 0
+                if count == holds:
+                    field[variables[at, j]] -= sign * weight[at]
+    return energy
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def quench(digital, x, field, true, energy):
-    """Flip single variables of every lane as long as each flip lowers its energy."""
-    half = F32(0.5)
+def quench(digital, x, field, true):
+    """Flip single variables of one restart as long as each flip lowers the energy; return the change."""
+    one, two, total = F32(1), F32(2), 0.0
     for _ in range(MAX_SWEEPS):
-        moving = False
-        for i in range(x.shape[0]):
-            # Most variables rest in all lanes: a vector comparison finds that out.
-            eager = 0
-            for k in range(x.shape[1]):
-                eager += 1 if (F32(1) - F32(2) * x[i, k]) * field[i, k] < 0 else 0
-            if eager > 0:
-                moving = True
-                for k in range(x.shape[1]):
-                    if (field[i, k] < 0) if x[i, k] < half else (field[i, k] > 0):
-                        energy[k] += flip(digital, x, field, true, i, k)
-        if not moving:
+        # A vector loop finds out whether anything moves; the sweep itself goes one by one.
+        n_eager = 0
+        for i in range(x.size):
+            n_eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
+        if n_eager == 0:
             break
+        for i in range(x.size):
+            if (one - two * x[i]) * field[i] < 0:
+                total += flip(digital, x, field, true, i)
+    return total
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def read_out(digital, linear, pairs, voltage, x, field, true, energy):
-    """Bring the digital states, their fields and energies up to the voltages; return how many bits changed."""
-    half = F32(0.5)
-    n, lanes = x.shape
-    n_changed = 0
-    for i in range(n):
+def read_out(digital, signs, x, field, true, found):
+    """Bring one restart up to its voltages' signs; return the change of energy and how many bits changed."""
+    change, n_found = 0.0, U64(0)
+    for i in range(U64(x.size)):
+        found[n_found] = i
+        n_found += U64(1) if signs[i] != x[i] else U64(0)
+    for m in range(n_found):
+        change += flip(digital, x, field, true, found[m])
+    return change, n_found
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def transpose_signs(voltage, signs):
+    """Write 1 for TRUE and 0 for FALSE, restart by restart, from voltages with the restarts last."""
+    n, lanes = voltage.shape
+    for first in range(0, n, 16):
         for k in range(lanes):
-            n_changed += 1 if (voltage[i, k] > 0) != (x[i, k] > half) else 0
-    if n_changed * MANY > n * lanes and true.size == 0:
-        for i in range(n):
-            for k in range(lanes):
-                x[i, k] = F32(1) if voltage[i, k] > 0 else F32(0)
-        local_fields(digital, linear, pairs, x, field, true, energy)
-    elif n_changed > 0:
-        for i in range(n):
-            here = 0
-            for k in range(lanes):
-                here += 1 if (voltage[i, k] > 0) != (x[i, k] > half) else 0
-            if here > 0:
-                for k in range(lanes):
-                    if (voltage[i, k] > 0) != (x[i, k] > half):
-                        energy[k] += flip(digital, x, field, true, i, k)
-    return n_changed
-
-
-MANY = 30
-"""Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def keep_best(x, energy, lowest, found_at, best, step):
-    """Remember the states that are the lowest of their lane so far."""
-    for k in range(energy.size):
-        if energy[k] < lowest[k]:
-            lowest[k] = energy[k]
-            new = step == 0
-            for i in range(x.shape[0]):
-                new |= best[k, i] != x[i, k]
-            if new:
-                found_at[k] = step
-                for i in range(x.shape[0]):
-                    best[k, i] = x[i, k]
+            for i in range(first, min(first + 16, n)):
+                signs[k, i] = F32(1) if voltage[i, k] > 0 else F32(0)
 
 
 @njit(nogil=True, cache=True)
@@ -394,41 +360,53 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                     smallest = min(smallest, half - half * sign * voltage[longer_variables[e, j], k])
             longer_memory[e, 0, k] = c[4] + smallest
             longer_memory[e, 1, k] = longer_long[e, k]
-    x, field, true = np.empty((n, lanes), F32), np.empty((n, lanes), F32), np.zeros((n_longer, lanes), np.int32)
-    tried, tried_field, tried_true = np.empty_like(x), np.empty_like(field), np.empty_like(true)
-    energy, reached = np.zeros(lanes), np.zeros(lanes)
+    x, field, true = np.empty((lanes, n), F32), np.empty((lanes, n), F32), np.zeros((lanes, n_longer), np.int32)
+    tried, tried_field, tried_true = np.empty(n, F32), np.empty(n, F32), np.empty(n_longer, np.int32)
+    signs, found = np.empty((lanes, n), F32), np.empty(n + 1, np.uint64)
+    energy, changed = np.zeros(lanes), np.full(lanes, True)
     lowest, found_at = np.full(lanes, 1e300), np.zeros(lanes, np.int64)
     elapsed, dt, size = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
     before = np.zeros((n, lanes), F32)
-    for i in range(n):
-        for k in range(lanes):
-            x[i, k] = one if voltage[i, k] > 0 else F32(0)
-    local_fields(digital, linear, pairs, x, field, true, energy)
+    transpose_signs(voltage, x)
+    for k in range(lanes):
+        energy[k] = local_fields(digital, linear, pairs, x[k], field[k], true[k])
     last, n_running = np.full(lanes, n_steps), lanes
-    n_changed, n_reads, counter = 1, 0, U64(0)
+    n_reads, counter = 0, U64(0)
     for step in range(n_steps + 1):
         recorded = every > 0 and step > 0 and step % every == 0
         reads = quench_every == 0 or step % quench_every == 0
         if step > 0 and (reads or recorded):
-            n_changed += read_out(digital, linear, pairs, voltage, x, field, true, energy)
+            transpose_signs(voltage, signs)
             n_reads += 1
-            if n_reads % REFRESH == 0:
-                local_fields(digital, linear, pairs, x, field, true, energy)
+            for k in range(lanes):
+                change, n_changed = read_out(digital, signs[k], x[k], field[k], true[k], found)
+                energy[k] += change
+                changed[k] = changed[k] or n_changed > 0
+                if n_reads % REFRESH == 0:
+                    energy[k] = local_fields(digital, linear, pairs, x[k], field[k], true[k])
         if reads:
-            keep_best(x, energy, lowest, found_at, best, step)
-        if reads and n_changed > 0 and quench_every > 0:
-            tried[:] = x
-            tried_field[:] = field
-            tried_true[:] = true
-            reached[:] = energy
-            quench(digital, tried, tried_field, tried_true, reached)
-            keep_best(tried, reached, lowest, found_at, best, step)
-            n_changed = 0
+            for k in range(lanes):
+                if not changed[k]:
+                    continue
+                if energy[k] < lowest[k]:
+                    lowest[k] = energy[k]
+                    if keep_if_new(x[k], best[k]) or step == 0:
+                        found_at[k] = step
+                if quench_every > 0:
+                    tried[:] = x[k]
+                    tried_field[:] = field[k]
+                    tried_true[:] = true[k]
+                    reached = energy[k] + quench(digital, tried, tried_field, tried_true)
+                    if reached < lowest[k]:
+                        lowest[k] = reached
+                        if keep_if_new(tried, best[k]) or step == 0:
+                            found_at[k] = step
+                changed[k] = False
         if recorded:
             for k in range(lanes):
                 times[k, step // every - 1] = elapsed[k]
                 for i in range(n):
-                    states[k, step // every - 1, i] = x[i, k] > half
+                    states[k, step // every - 1, i] = x[k, i] > half
         # One pass moves the memories by the step that led here and finds the rate of the voltages.
         rate[:] = 0
         if kind == BOND:

@@ -22,6 +22,7 @@ from memcomp_lightning.dmm.kernels.common import (
     TINY,
     clause,
     clause_rates,
+    keep_if_new,
     uniform,
 )
 
@@ -225,16 +226,6 @@ def read_out(n_first, n_second, coupling, transposed, linear, voltage, x, field,
 
 MANY = 3
 """Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
-
-
-@njit(nogil=True, cache=True)
-def keep_if_new(x, best):
-    """Copy a state; return whether it differs."""
-    new = False
-    for i in range(x.size):
-        new |= best[i] != x[i]
-        best[i] = x[i]
-    return new
 
 
 @njit(nogil=True, cache=True)
