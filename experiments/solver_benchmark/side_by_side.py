@@ -177,7 +177,9 @@ class Dmm:
     field: ClassVar[VectorField[Any, Any]] = ClauseField()
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        solver = DmmSolver(field=self.field, max_steps=budget or None)
+        solver = DmmSolver(field=self.field)
+        if budget:
+            solver = replace(solver, max_steps=budget, stall=None)
         generator = rng.stream(seed, "dmm")
 
         def part(n: int) -> tuple[Tensor, float]:
@@ -190,7 +192,7 @@ class Dmm:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DmmTuned(Dmm):
-    """The same with its steps tuned like an opponent's; budget: ``max_steps``."""
+    """The same with its steps tuned like an opponent's; budget: ``max_steps``, all of which each restart does."""
 
     name: ClassVar[str] = "DMM, steps tuned"
     budgets: ClassVar[tuple[int, ...]] = (30, 100, 300, 1000, 3000, 10_000)

@@ -15,7 +15,6 @@ from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.scaling import (
     DEGREE_EXPONENT,
     by_largest,
-    collective_mode,
     coupling_norm,
     decisive,
     effective_degree,
@@ -102,7 +101,7 @@ class ClauseField:
     noise: float = 0.0
     spread: float = 0.5
     integrator: Integrator = field(
-        default_factory=lambda: Splitting(change=0.9, dt_min=0.0126, dt_max=6.0, lag=0.27)
+        default_factory=lambda: Splitting(change=0.9, dt_min=0.0126, dt_max=6.0, lag=0.3)
     )
 
     def __post_init__(self) -> None:
@@ -144,7 +143,6 @@ class ClauseField:
             maxsat.graph.scatter(of_pairs, of_pairs) + _per_variable(longer, of_longer, maxsat.n)
             for of_pairs, of_longer in ((weight, longer_weight), (weight.square(), longer_weight.square()))
         )
-        collective = collective_mode(maxsat.graph, weight * maxsat.first * maxsat.second)
         return ClauseMachine(
             graph=maxsat.graph,
             weight=weight.unsqueeze(-1 - n_axes),
@@ -155,12 +153,12 @@ class ClauseField:
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
             longer_weight=longer_weight.unsqueeze(-2),
-            stability=step_scale(maxsat.n, (size > 0).sum(-1), collective).unsqueeze(-1),
+            stability=step_scale(maxsat.n, (size > 0).sum(-1)).to(weight.dtype).unsqueeze(-1),
             degree=effective_degree(size, power),
         )
 
     def stability(self, machine: ClauseMachine) -> Tensor:
-        """Smaller steps where all variables pull alike."""
+        """Smaller steps for larger problems."""
         return machine.stability
 
     def init(self, machine: ClauseMachine, voltage: Tensor) -> ClauseState:

@@ -56,10 +56,8 @@ DEGREE_EXPONENT = 0.17
 """How the best bound of the long-term memories, less 1, falls with the effective degree."""
 
 
-def step_scale(n: int, n_coupled: Tensor, collective: Tensor) -> Tensor:
-    r"""What a step that suits 200 independent variables is multiplied by, ``(*problems,)``.
-
-    .. math:: \text{collective} \cdot (n_c / 200)^{-SIZE_EXPONENT} \sqrt{n_c / n}
+def step_scale(n: int, n_coupled: Tensor) -> Tensor:
+    r"""``(n_c / 200)^{-0.3} \sqrt{n_c / n}``, what a step that suits 200 variables is multiplied by, ``(*problems,)``.
 
     Larger problems want smaller steps (measured); the root takes off what variables without couplings add to the
     number of variables in a root mean square.
@@ -67,10 +65,9 @@ def step_scale(n: int, n_coupled: Tensor, collective: Tensor) -> Tensor:
     Args:
         n: Number of variables.
         n_coupled: Number n_c of those that are coupled, ``(*problems,)``.
-        collective: From :func:`collective_mode`.
     """
-    count = n_coupled.clamp(min=1).to(collective.dtype)
-    return collective * (count / 200) ** -SIZE_EXPONENT * (count / n).sqrt()
+    count = n_coupled.clamp(min=1).double()
+    return (count / 200) ** -SIZE_EXPONENT * (count / n).sqrt()
 
 
 SIZE_EXPONENT = 0.3

@@ -244,8 +244,8 @@ class _Part(NamedTuple):
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Most steps a restart: three for each variable up to 200, then by the rule ``600 (n / 200)^(1/2)``."""
-    return max(50, round(min(3 * problem.n, 600 * math.sqrt(problem.n / 200))))
+    """Most steps a restart: three for each variable up to 200, then by the rule ``600 (n / 200)^(1/4)``."""
+    return max(50, round(min(3 * problem.n, 600 * math.pow(problem.n / 200, 0.25))))
 
 
 def default_min_steps(problem: Qubo | WeightedMaxSat) -> int:

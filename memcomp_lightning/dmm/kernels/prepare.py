@@ -58,10 +58,10 @@ def prepare(kind, width, height, coupling, linear, weight, unit, scalars, digita
         scalars[p, 2] = _effective_degree(scaled, sums)
         scaled[:] = scaled / norm
         own[:] = own / norm
-        collective = _collective_mode(scaled)
-        scalars[p, 0] = collective * (n_coupled / 200) ** -SIZE_EXPONENT * math.sqrt(n_coupled / n)
+        scalars[p, 0] = (n_coupled / 200) ** -SIZE_EXPONENT * math.sqrt(n_coupled / n)
         scalars[p, 1] = 1.0
         if kind == BOND:
+            collective = _collective_mode(scaled)
             scaled[:] = scaled * -collective
             own[:] = own * collective
         _add_both(np.abs(scaled), sums)
