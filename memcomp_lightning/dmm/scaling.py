@@ -57,7 +57,7 @@ DEGREE_EXPONENT = 0.17
 
 
 def step_scale(n: int, n_coupled: Tensor) -> Tensor:
-    r"""``(n_c / 200)^{-0.3} \sqrt{n_c / n}``, what a step that suits 200 variables is multiplied by, ``(*problems,)``.
+    r"""Factor ``(n_c / 200)^{-0.3} \sqrt{n_c / n}`` on a step that suits 200 variables, ``(*problems,)``.
 
     Larger problems want smaller steps (measured); the root takes off what variables without couplings add to the
     number of variables in a root mean square.
