@@ -16,7 +16,7 @@ from memcomp_lightning.dmm.base import Recording
 from memcomp_lightning.dmm.bond import BondField, BondMachine
 from memcomp_lightning.dmm.clause import ClauseField, ClauseMachine
 from memcomp_lightning.dmm.integrate import Splitting
-from memcomp_lightning.dmm.kernels import lanes, rows
+from memcomp_lightning.dmm.kernels import common, lanes, rows
 from memcomp_lightning.dmm.kernels.common import BOND
 from memcomp_lightning.dmm.kernels.prepare import prepare
 from memcomp_lightning.dmm.kernels.run import Run, Stall, Start, Visited
@@ -357,6 +357,11 @@ _SHORT = 2e8
 @cache
 def _announce(kernel: Any) -> None:
     """Say once that the first call compiles, if nothing is cached on disk."""
-    folder = Path(kernel.stats.cache_path)
-    if not any(folder.glob(f"{kernel.py_func.__module__.rpartition('.')[2]}.{kernel.__name__}*.nbi")):
+    folder, module = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
+    # numba compiles anew when a function's own file changes, not when what it inlines does.
+    inlined = Path(common.__file__).stat().st_mtime
+    for index in folder.glob(f"{module}.*.nbi"):
+        if index.stat().st_mtime < inlined:
+            index.unlink(missing_ok=True)
+    if not any(folder.glob(f"{module}.{kernel.__name__}*.nbi")):
         log.warning("Compiling the DMM kernel for this processor, once (about half a minute); kept in %s", folder)

@@ -90,41 +90,49 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
             r[pull_b + k] += push[k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
-def longer_pass(variables, polarity, weight, memory, voltage, rate, falsehood, c, dt):
-    """The same for clauses of three literals and more, padded with polarity 0; ``falsehood`` is scratch."""
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
+    """The same for clauses of three literals and more, padded with polarity 0; the last arrays are scratch."""
     zero, half, one = F32(0), F32(0.5), F32(1)
     alpha, beta, gamma, delta, epsilon, cap = c[0], c[1], c[2], c[3], c[4], c[6] - one
-    lanes = dt.size
+    variables, polarity, weight = longer
+    lanes = U64(dt.size)
+    m, v, r, f = memory.ravel(), voltage.ravel(), rate.ravel(), falsehood.ravel()
+    smallest, next_smallest, at, gradient, rigidity = scratch
     for e in range(weight.size):
-        w = weight[e]
-        length = 0
-        while length < variables.shape[1] and polarity[e, length] != 0:
-            length += 1
-        for i in range(length):
-            variable, q = variables[e, i], polarity[e, i]
-            for k in range(lanes):
-                falsehood[i, k] = half - half * q * voltage[variable, k]
+        w, short = weight[e], U64(2 * e) * lanes
+        long = short + lanes
+        smallest[:] = one + one
+        next_smallest[:] = one + one
+        for i in range(variables.shape[1]):
+            q = polarity[e, i]
+            if q != 0:
+                literal, a, number = U64(i) * lanes, U64(variables[e, i]) * lanes, F32(i)
+                for k in range(lanes):
+                    f[literal + k] = half - half * q * v[a + k]
+                for k in range(lanes):
+                    next_smallest[k] = min(next_smallest[k], max(f[literal + k], smallest[k]))
+                for k in range(lanes):
+                    at[k] = number if f[literal + k] < smallest[k] else at[k]
+                for k in range(lanes):
+                    smallest[k] = min(f[literal + k], smallest[k])
         for k in range(lanes):
-            smallest, next_smallest, at = F32(2), F32(2), 0
-            for i in range(length):
-                f = falsehood[i, k]
-                if f < smallest:
-                    smallest, next_smallest, at = f, smallest, i
-                elif f < next_smallest:
-                    next_smallest = f
-            s = min(one + epsilon, max(epsilon, memory[e, 0, k] * (one + dt[k] * beta * (smallest - gamma))))
-            x = memory[e, 1, k]
-            excess = dt[k] * alpha * (smallest - delta)
-            x = min(cap, max(F32(0), x + excess * (one if excess > zero else x)))
-            memory[e, 0, k] = s
-            memory[e, 1, k] = x
-            agile = w * (s - epsilon)
-            gradient = agile + agile * x
-            rigidity = (w - agile) * smallest
-            for i in range(length):
-                push = gradient * next_smallest + rigidity if i == at else gradient * smallest
-                rate[variables[e, i], 0, k] += polarity[e, i] * push
+            excess = dt[k] * beta * (smallest[k] - gamma)
+            m[short + k] = min(one + epsilon, max(epsilon, m[short + k] * (one + excess)))
+        for k in range(lanes):
+            excess, x = dt[k] * alpha * (smallest[k] - delta), m[long + k]
+            m[long + k] = min(cap, max(zero, x + excess * (one if excess > zero else x)))
+        for k in range(lanes):
+            gradient[k] = w * (m[short + k] - epsilon) * (one + m[long + k])
+        for k in range(lanes):
+            rigidity[k] = w * (one + epsilon - m[short + k]) * smallest[k]
+        for i in range(variables.shape[1]):
+            q = polarity[e, i]
+            if q != 0:
+                a, number = U64(2 * variables[e, i]) * lanes, F32(i)
+                for k in range(lanes):
+                    at_first = gradient[k] * next_smallest[k] + rigidity[k]
+                    r[a + k] += q * (at_first if at[k] == number else gradient[k] * smallest[k])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -292,7 +300,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
             return
         p, b = item // n_blocks, item % n_blocks
         found_at[p, b], last[p, b] = integrate(
-            (kind, pairs, weight[p], polarity[p], unit[p], variables, longer_polarity, longer_weight[p]),
+            (kind, pairs, weight[p], polarity[p], unit[p], (variables, longer_polarity, longer_weight[p])),
             (
                 offsets,
                 neighbour,
@@ -321,8 +329,8 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     """Integrate the lanes of a block; return the step at which each one's ``best`` was met, and its last step.
 
     Args:
-        problem: (kind, pairs, weight or bond, polarity, unit or field, variables, polarity and weight of the
-            longer clauses).
+        problem: (kind, pairs, weight or bond, polarity, unit or field, the longer clauses: variables, polarity
+            and weight).
         digital: What ``flip`` needs.
         linear: ``(n,)``, of the energy.
         c: Constants of the field, in the order of ``cpu._constants``.
@@ -336,7 +344,8 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         times: ``(lanes, n_records)``, out.
         states: ``(lanes, n_records, n)``, out.
     """
-    kind, pairs, weight, polarity, unit, longer_variables, longer_polarity, longer_weight = problem
+    kind, pairs, weight, polarity, unit, longer = problem
+    longer_variables, longer_polarity, longer_weight = longer
     voltage, long, unit_long, longer_long, seeds = start
     n_steps, quench_every, every, min_steps, stall = steps
     half, one = F32(0.5), F32(1)
@@ -345,6 +354,9 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     memory, longer_memory = np.empty((n_pairs, 2, lanes), F32), np.empty((n_longer, 2, lanes), F32)
     unit_short = np.full((n, lanes), c[8], F32)
     falsehood = np.empty((longer_variables.shape[1], lanes), F32)
+    # Arrays of their own: rows of one array could overlap for all that the compiler knows.
+    smallest, next_smallest, at = np.empty(lanes, F32), np.empty(lanes, F32), np.empty(lanes, F32)
+    scratch = (smallest, next_smallest, at, np.empty(lanes, F32), np.empty(lanes, F32))
     for e in range(n_pairs):
         for k in range(lanes):
             false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
@@ -353,12 +365,12 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
             memory[e, 1, k] = long[e, k]
     for e in range(n_longer):
         for k in range(lanes):
-            smallest = one
+            unsatisfied = one
             for j in range(longer_variables.shape[1]):
                 sign = longer_polarity[e, j]
                 if sign != 0:
-                    smallest = min(smallest, half - half * sign * voltage[longer_variables[e, j], k])
-            longer_memory[e, 0, k] = c[4] + smallest
+                    unsatisfied = min(unsatisfied, half - half * sign * voltage[longer_variables[e, j], k])
+            longer_memory[e, 0, k] = c[4] + unsatisfied
             longer_memory[e, 1, k] = longer_long[e, k]
     x, field, true = np.empty((lanes, n), F32), np.empty((lanes, n), F32), np.zeros((lanes, n_longer), np.int32)
     tried, tried_field, tried_true = np.empty(n, F32), np.empty(n, F32), np.empty(n_longer, np.int32)
@@ -415,9 +427,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         else:
             clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt)
             clause_units(unit, unit_long, voltage, rate, c, dt)
-            longer_pass(
-                longer_variables, longer_polarity, longer_weight, longer_memory, voltage, rate, falsehood, c, dt
-            )
+            longer_pass(longer, longer_memory, voltage, rate, falsehood, scratch, c, dt)
         if reads:
             for k in range(lanes):
                 if last[k] == n_steps and step < n_steps and step >= min_steps + stall * found_at[k]:
