@@ -1,6 +1,8 @@
 """QUBO and weighted MAX-SAT: problems and their files, exact mappings between them, simple solvers."""
 
 from memcomp_lightning.qubo.alternating_descent import AlternatingDescent
+from memcomp_lightning.qubo.annealing import GibbsAnnealing
+from memcomp_lightning.qubo.branch_and_bound import BranchAndBound
 from memcomp_lightning.qubo.brute_force import BruteForce
 from memcomp_lightning.qubo.formats import FORMATS, ProblemFileError
 from memcomp_lightning.qubo.from_model import from_model
@@ -13,9 +15,11 @@ __all__ = [
     "FORMATS",
     "AlternatingDescent",
     "Bipartite",
+    "BranchAndBound",
     "BruteForce",
     "Clauses",
     "EdgeList",
+    "GibbsAnnealing",
     "Graph",
     "Problem",
     "ProblemFileError",

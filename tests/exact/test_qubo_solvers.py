@@ -6,7 +6,15 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo, Status, from_model
+from memcomp_lightning.qubo import (
+    AlternatingDescent,
+    BranchAndBound,
+    BruteForce,
+    GibbsAnnealing,
+    Qubo,
+    Status,
+    from_model,
+)
 from memcomp_lightning.testing.conformance import small_rbm
 
 
@@ -105,3 +113,61 @@ def test_best_is_the_restart_of_lowest_energy(qubo):
 def test_messages_count_the_restarts_with_advice():
     solution = solve(AlternatingDescent(n_restarts=23), PROBLEMS["batch of dense"])
     assert solution.messages() == {f"CONVERGED: {Status.CONVERGED.advice}": 6 * 23}
+
+
+@pytest.mark.parametrize("name", ["model 7 x 5", "models 5 x 7"])
+def test_branch_and_bound_proves_the_minimum(name):
+    qubo = PROBLEMS[name]
+    solution = solve(BranchAndBound(), qubo)
+    torch.testing.assert_close(solution.best_energy, solve(BruteForce(), qubo).best_energy, rtol=1e-13, atol=0)
+    assert (solution.status == Status.OPTIMAL).all()
+    assert (solution.steps < 2**6).all()
+
+
+@pytest.mark.parametrize(("n_visible", "n_hidden"), [(23, 17), (17, 23)])
+def test_branch_and_bound_finds_what_descent_misses(n_visible, n_hidden):
+    """Mean-cancelled couplings, of which descent rarely finds the minimum."""
+    weight = matrix(5, n_hidden, n_visible)
+    rbm = small_rbm(n_visible, n_hidden, replicas=(5,)).double()
+    with torch.no_grad():
+        rbm.weight.copy_(weight)
+        rbm.b.copy_(-weight.sum(-2) / 2)
+        rbm.c.copy_(-weight.sum(-1) / 2)
+    qubo = from_model(rbm)
+    solution = solve(BranchAndBound(), qubo)
+    assert (solution.status == Status.OPTIMAL).all()
+    torch.testing.assert_close(solution.best_energy, solve(BruteForce(), qubo).best_energy, rtol=1e-12, atol=0)
+    assert (solution.best_energy < solve(AlternatingDescent(n_restarts=28), qubo).best_energy - 1e-6).any()
+
+
+def test_branch_and_bound_says_when_it_gave_up():
+    solution = solve(BranchAndBound(max_nodes=3), PROBLEMS["models 5 x 7"])
+    assert (solution.status == Status.STEP_BUDGET).all()
+    assert torch.isfinite(solution.energies).all()
+
+
+def test_branch_and_bound_refuses_other_graphs():
+    with pytest.raises(SettingError, match="takes two fully coupled layers"):
+        solve(BranchAndBound(), PROBLEMS["dense"])
+
+
+def test_annealing_finds_the_minimum(qubo):
+    best = solve(GibbsAnnealing(n_restarts=53, n_sweeps=101), qubo).best_energy
+    torch.testing.assert_close(best, solve(BruteForce(), qubo).best_energy)
+
+
+def test_annealing_beats_as_many_descents():
+    qubo = from_model(small_rbm(31, 29).double())
+    annealed = solve(GibbsAnnealing(n_restarts=101), qubo).energies
+    descended = solve(AlternatingDescent(n_restarts=101), qubo).energies
+    assert annealed.mean() < descended.mean()
+
+
+def test_annealing_at_one_temperature_samples_it():
+    """Without the descent that closes, its states follow exp(-beta E): hotter restarts end higher on average."""
+    qubo = from_model(small_rbm(31, 29).double())
+    cold, hot = (
+        solve(GibbsAnnealing(n_restarts=101, n_sweeps=31, beta_first=b, beta_last=b), qubo).energies.mean()
+        for b in (4.0, 0.05)
+    )
+    assert cold < hot

@@ -8,7 +8,7 @@ import torch
 
 from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, Qubo
+from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, Qubo
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
 from memcomp_lightning.samplers.gibbs import sweep
 from memcomp_lightning.testing import check_sampler, check_solver
@@ -29,6 +29,7 @@ SOLVERS = {
     ),
     "DMM of another scheme": DmmSolver(integrator=Heun(), n_restarts=11, max_steps=101),
     "descent": AlternatingDescent(n_restarts=53),
+    "annealing": GibbsAnnealing(n_restarts=53),
     "brute force": BruteForce(),
     "brute force in chunks": BruteForce(chunk_size=13),
 }
