@@ -42,6 +42,10 @@ class MomentumSchedule(pl.Callback):
             "Leave the schedule out: callbacks.pretrain.momentum_schedule=null, callbacks.finetune likewise.",
         )
 
+    def momentum(self, iteration: int) -> float:
+        """Momentum of a pass, by its number from 0 within the stage or layer."""
+        return self.initial if iteration < self.switch_at else self.final
+
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Refuse optimisers without momentum."""
         for optimizer in trainer.optimizers:
@@ -49,7 +53,7 @@ class MomentumSchedule(pl.Callback):
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Set the momentum of this pass."""
-        momentum = self.initial if iteration_of(pl_module) < self.switch_at else self.final
+        momentum = self.momentum(iteration_of(pl_module))
         for optimizer in trainer.optimizers:
             for group in optimizer.param_groups:
                 group["momentum"] = momentum

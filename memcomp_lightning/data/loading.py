@@ -1,7 +1,8 @@
 """Batches of images that lie in memory: gathered by index, split over processes and into chunks."""
 
+import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -71,9 +72,33 @@ class Batches:
         self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
         # Contiguous, the images of all replicas are the rows of one matrix.
         self._v, self._label = (v.contiguous(), label.contiguous()) if self._shuffle else (v, label)
-        self._seed, self._epoch = seed, 0
+        self._seeds: tuple[int, ...] = (seed,)
+        self._replicas = tuple(label.shape[:-1])
+        self._epoch = 0
         self._progress = {"epoch": 0, "position": 0}
         self._resume: dict[str, int] | None = None
+
+    def repeated(self, seeds: Sequence[int]) -> "Batches":
+        """Return the same images once for each seed, each time in the order of that seed, on one replica axis.
+
+        Args:
+            seeds: One for each repetition, at least one; equal seeds have the same order.
+        """
+        require(len(seeds) > 0, "seeds", list(seeds), "at least one seed")
+        repeated = copy.copy(self)
+        repeated._seeds = tuple(seeds)
+        repeated._replicas = (len(seeds) * math.prod(self._replicas),)
+        if not self._shuffle:
+            n, units = self._v.shape[-2:]
+            repeated._v = self._v.reshape(-1, n, units).repeat(len(seeds), 1, 1)
+            repeated._label = self._label.reshape(-1, n).repeat(len(seeds), 1)
+        return repeated
+
+    def to(self, device: torch.device | str) -> "Batches":
+        """Return the same batches with all images on a device."""
+        moved = copy.copy(self)
+        moved._v, moved._label = self._v.to(device), self._label.to(device)
+        return moved
 
     @property
     def sampler(self) -> "Batches":
@@ -133,10 +158,13 @@ class Batches:
     def _order(self) -> Int[Tensor, "*replicas n"]:
         """Return this epoch's order, as rows of all replicas' images laid end to end."""
         *replicas, n = self._label.shape
-        generator = rng.stream(self._seed, "data_order", self._epoch)
         first_rows = range(0, math.prod(replicas) * n, n)
-        order = torch.stack([torch.randperm(n, generator=generator) + first for first in first_rows])
-        return order.view(*replicas, n).to(self._v.device)
+        orders = {}
+        for seed in dict.fromkeys(self._seeds):
+            generator = rng.stream(seed, "data_order", self._epoch)
+            orders[seed] = torch.stack([torch.randperm(n, generator=generator) + first for first in first_rows])
+        order = torch.cat([orders[seed] for seed in self._seeds])
+        return order.view(*self._replicas, n).to(self._v.device)
 
 
 class _Chunk(NamedTuple):

@@ -30,6 +30,7 @@ class ImageDataModule(LightningDataModule):
         images: The data.
         batch_size: Images of a replica in an optimiser step, over all processes; None means all of them.
         partitions: Number of parts, >= 1; 1 means the whole set and no replica axis.
+        first_partitions: Use at most so many of the parts, >= 1; None means all.
         validation_fraction: Share of each part's training images that is held out for validation, in
             [0, 1), rounded to whole images. With 0 the *test* images are shown as validation set: look at
             them while training, but never choose a setting or a checkpoint by them.
@@ -47,6 +48,7 @@ class ImageDataModule(LightningDataModule):
         *,
         batch_size: int | None = 100,
         partitions: int = 1,
+        first_partitions: int | None = None,
         validation_fraction: float = 0.0,
         chunk_size: int = 10_000,
         seed: int = 0,
@@ -54,8 +56,12 @@ class ImageDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         self._check(images, partitions, validation_fraction, partition_seed)
+        n_parts = partitions
+        if first_partitions is not None:
+            require_count("first_partitions", first_partitions)
+            n_parts = min(partitions, first_partitions)
         self.images = images
-        self.replicas: tuple[int, ...] = (partitions,) if partitions > 1 else ()
+        self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
         n_part = len(images.train_label) // partitions
         n_held_out = round(validation_fraction * n_part)
@@ -66,11 +72,21 @@ class ImageDataModule(LightningDataModule):
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
             order = torch.randperm(len(images.train_label), generator=generator)
-            order = order[: partitions * n_part].view(*self.replicas, n_part)
+            order = order[: n_parts * n_part].view(*self.replicas, n_part)
             self._train = self._take(order[..., : self.n_train])
             if n_held_out:
                 self._held_out = self._take(order[..., self.n_train :])
         self.train_batches(rank=0, world_size=1)
+
+    @property
+    def test(self) -> tuple[Tensor, Tensor]:
+        """Test images ``(n, n_visible)`` and labels ``(n,)``."""
+        return self.images.test_v, self.images.test_label
+
+    @property
+    def validation(self) -> tuple[Tensor, Tensor] | None:
+        """Held-out training images ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
+        return None if self._held_out[0] is self.images.test_v else self._held_out
 
     @property
     def n_visible(self) -> int:

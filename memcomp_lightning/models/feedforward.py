@@ -10,6 +10,7 @@ from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.rng import stream
 
@@ -127,3 +128,16 @@ class BatchNormReluNetwork(nn.Module):
         """Class logits."""
         logits: Tensor = self.layers(v)
         return logits
+
+
+def with_batch_norm_relu(dbn: DBN) -> nn.Sequential:
+    """Return the layers of a DBN with batch normalisation and ReLU in place of the sigmoid.
+
+    Weights and hidden biases are the DBN's own parameters: what trains one trains the other.
+    """
+    layers: list[nn.Module] = []
+    for rbm in dbn:
+        linear = Linear(rbm.n_visible, rbm.n_hidden, replicas=rbm.replicas)
+        linear.weight, linear.bias = rbm.weight, rbm.c
+        layers += [linear, BatchNorm(rbm.n_hidden, replicas=rbm.replicas), nn.ReLU()]
+    return nn.Sequential(*layers)

@@ -1,24 +1,26 @@
 """Fine-tuning: a DBN becomes a classifier."""
 
 from collections.abc import Iterable
+from typing import Literal
 
 from torch import Generator, nn
 from torch.nn import Parameter
 
-from memcomp_lightning.errors import require_count
-from memcomp_lightning.models import DBN, Initialiser, Linear
+from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.models import DBN, Initialiser, Linear, with_batch_norm_relu
 from memcomp_lightning.modules.classifier import Classifier
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
 
 
 class DBNClassifier(Classifier):
-    """The DBN with sigmoid units and a linear output layer on top, all trained by back-propagation.
+    """The DBN with a linear output layer on top, all trained by back-propagation.
 
     Args:
         dbn: The network, pretrained or not; trained in place.
         n_classes: Size of the output layer, >= 2.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser.
+        units: Hidden units: "sigmoid", or "batch_norm_relu" for batch normalisation and ReLU on the same weights.
         output_init: Draws the weights of the output layer; None is N(0, 0.01^2).
         generator: Random stream of these weights; None is a fresh stream of seed 0.
         seed: Seed of the random streams.
@@ -31,15 +33,18 @@ class DBNClassifier(Classifier):
         n_classes: int = 10,
         iterations: int = 100,
         optimizer: OptimizerFactory = PAPER_SGD,
+        units: Literal["sigmoid", "batch_norm_relu"] = "sigmoid",
         output_init: Initialiser | None = None,
         generator: Generator | None = None,
         seed: int = 0,
     ) -> None:
         require_count("n_classes", n_classes, minimum=2)
+        require_choice("finetune.units", units, ("sigmoid", "batch_norm_relu"))
         output = Linear(
             dbn.n_hidden, n_classes, replicas=dbn.replicas, weight_init=output_init, generator=generator
         )
-        network = nn.Sequential(dbn, output.to(dbn[0].weight))
+        hidden = dbn if units == "sigmoid" else with_batch_norm_relu(dbn).to(dbn[0].weight)
+        network = nn.Sequential(hidden, output.to(dbn[0].weight))
         super().__init__(network, iterations=iterations, optimizer=optimizer, seed=seed)
         self.dbn = dbn
 

@@ -224,3 +224,29 @@ def test_settings_are_checked_at_construction(settings, message):
 
 def test_batch_may_be_all_images_that_are_not_held_out():
     assert len(make(batch_size=37, validation_fraction=0.1).train_dataloader()) == 1
+
+
+def test_first_partitions_are_the_first_of_all():
+    everything = ImageDataModule(images(), partitions=5, batch_size=None)
+    few = ImageDataModule(images(), partitions=5, first_partitions=2, batch_size=None)
+    assert few.replicas == (2,)
+    (all_parts,), (first,) = everything.train_batches(0, 1), few.train_batches(0, 1)
+    assert first.v.equal(all_parts.v[:2])
+    assert ImageDataModule(images(), first_partitions=3, batch_size=None).replicas == ()
+
+
+@pytest.mark.parametrize("partitions", [1, 3])
+@pytest.mark.parametrize("batch_size", [None, 7])
+def test_repeated_batches_are_those_of_each_seed(partitions, batch_size):
+    def batches(seed):
+        data = ImageDataModule(images(), partitions=partitions, batch_size=batch_size, seed=seed)
+        return data.train_batches(0, 1)
+
+    together, alone = batches(0).repeated([4, 9, 4]), [batches(seed) for seed in (4, 9, 4)]
+    for epoch in (0, 3):
+        for part in (together, *alone):
+            part.set_epoch(epoch)
+        for whole, *parts in zip(together, *alone, strict=True):
+            assert whole.v.equal(torch.cat([part.v.view(-1, *part.v.shape[-2:]) for part in parts]))
+            assert whole.label.equal(torch.cat([part.label.view(-1, part.label.shape[-1]) for part in parts]))
+            assert all(whole[2:] == part[2:] for part in parts)
