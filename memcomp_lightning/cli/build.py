@@ -17,7 +17,7 @@ from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
-from memcomp_lightning.models import DBN
+from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import Classifier, DBNClassifier, DBNPretraining, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import load_weights
 
@@ -39,11 +39,13 @@ class Plan:
         network: What is trained; the stages share it.
         pretraining: The first stage, None for a network without pretraining.
         finetuning: The last stage, None if left out.
+        between: Changes the network after its pretraining, None if nothing does.
     """
 
     network: nn.Module
     pretraining: Stage | None
     finetuning: Stage | None
+    between: Randomiser | None = None
 
     @property
     def stages(self) -> list[Stage]:
@@ -52,11 +54,12 @@ class Plan:
 
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
+_GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks")
 _SETTINGS = {
-    "": ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks", "seed"),
-    "data": ("source", "partitions", "validation_fraction", "chunk_size"),
+    "": (*_GROUPS, "seed", "between_stages", "figure"),
+    "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": _STAGE_SETTINGS,
-    "finetune": _STAGE_SETTINGS,
+    "finetune": (*_STAGE_SETTINGS, "units"),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
@@ -105,12 +108,18 @@ def build(config: DictConfig) -> Plan:
             generator = rng.stream(seed, "output weights")
             output_init = instantiate(config.model.get("output_init"))
             classifier = DBNClassifier(
-                network, n_classes=images.n_classes, output_init=output_init, generator=generator, **settings
+                network,
+                n_classes=images.n_classes,
+                units=config.finetune.units,
+                output_init=output_init,
+                generator=generator,
+                **settings,
             )
         else:
             classifier = Classifier(network, **settings)
         finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
-    plan = Plan(network, pretraining, finetuning)
+    between = instantiate(config.between_stages) if isinstance(network, DBN) else None
+    plan = Plan(network, pretraining, finetuning, between)
     require(
         bool(plan.stages),
         "finetune.iterations",
@@ -125,11 +134,11 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
     assert isinstance(settings, dict)
     weights = settings.pop("weights", None)
     settings.pop("output_init", None)
-    partitions = config.data.partitions
+    partitions, first = config.data.partitions, config.data.first_partitions
     require_count("data.partitions", partitions)
     arguments: dict[str, Any] = {
         "n_visible": images.layout.n_visible,
-        "replicas": (partitions,) if partitions > 1 else (),
+        "replicas": (min(partitions, first or partitions),) if partitions > 1 else (),
         "generator": rng.stream(config.seed, "weights"),
     }
     factory = instantiate(settings, _partial_=True, _convert_="all")
@@ -152,6 +161,7 @@ def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
             images,
             batch_size=config[stage].batch_size,
             partitions=config.data.partitions,
+            first_partitions=config.data.first_partitions,
             validation_fraction=config.data.validation_fraction,
             chunk_size=config.data.chunk_size,
             seed=config.seed,

@@ -48,7 +48,7 @@ def check_command_line(
     arguments: Sequence[str],
     *,
     config_name: str,
-    check: Callable[[DictConfig], object],
+    check: Callable[[DictConfig, Sequence[str]], object],
     folders: tuple[str, str],
 ) -> None:
     """Check every job that the arguments stand for, and do none; with other flags, such as --help, nothing.
@@ -56,7 +56,8 @@ def check_command_line(
     Args:
         arguments: As typed, without the program's name.
         config_name: The configuration that the overrides are for.
-        check: Builds what a job needs, or raises one of ``CONFIGURATION_ERRORS``.
+        check: Builds what a job needs, from its configuration and overrides, or raises one of
+            ``CONFIGURATION_ERRORS``.
         folders: Where a run and a sweep write, unless the arguments say it.
 
     Raises:
@@ -79,7 +80,7 @@ def check_command_line(
             raise UserError(explain(error)) from error
         for job in jobs:
             try:
-                check(compose(config_name, job))
+                check(compose(config_name, job), job)
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error

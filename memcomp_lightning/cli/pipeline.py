@@ -13,10 +13,12 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from memcomp_lightning import rng
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, DBNPretraining, evaluate, load_weights, save_weights
 from memcomp_lightning.modules.weights import AtomicCheckpointIO, check_fits, read_checkpoint
 
@@ -37,6 +39,8 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         if name in done:
             load_weights(_trained(stage), folder.weights(name))
             records[name] = done[name]
+            if stage is plan.pretraining:
+                _between(plan, config)
             continue
         trainer = _fit(stage, config, folder, loggers)
         is_global_zero = trainer.is_global_zero
@@ -44,6 +48,8 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         if is_global_zero and not config.trainer.fast_dev_run:
             save_weights(_trained(stage), folder.weights(name))
             folder.finish_stage(name, records[name])
+        if stage is plan.pretraining:
+            _between(plan, config)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
     if plan.finetuning is not None:
         score = evaluate(_trained(plan.finetuning), plan.finetuning.data.test_dataloader())
@@ -53,6 +59,12 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         _log_final(loggers, config, result)
         folder.finish(result)
     return result
+
+
+def _between(plan: Plan, config: DictConfig) -> None:
+    """What is done to the pretrained network before it is fine-tuned, the same when a run is resumed."""
+    if plan.between is not None and isinstance(plan.network, DBN):
+        plan.between(plan.network, generator=rng.stream(config.seed, "between stages"))
 
 
 _SET_BY_STAGE = (

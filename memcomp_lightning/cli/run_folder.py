@@ -1,5 +1,6 @@
 """The folder of one run: settings, checkpoints, weights, result. Every file is written whole."""
 
+import hashlib
 import json
 import os
 import platform
@@ -11,6 +12,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.files import write_text
@@ -71,6 +73,23 @@ class RunFolder:
                 "hydra.run.dir=PATH"
             ) from error
 
+    def check_source(self) -> None:
+        """Note which code makes the results of this folder, or check that it is the same.
+
+        Raises:
+            UserError: Other code made what is there.
+        """
+        now = {"memcomp_lightning": __version__, "source": _source(), **_machine()}
+        there = self._read("origin.json")
+        if there is None:
+            self._write("origin.json", now)
+        elif there["source"] != now["source"]:
+            raise UserError(
+                f"run folder {self.path} was made by version {there['memcomp_lightning']}, source "
+                f"{there['source']}; this is {__version__}, source {now['source']}. Results of different code are "
+                "never mixed: choose another folder with hydra.run.dir=PATH, or go back to that version."
+            )
+
     def finish_stage(self, stage: str, record: dict[str, Any]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
         self._write("stages.json", {**self.finished_stages, stage: record})
@@ -78,12 +97,7 @@ class RunFolder:
 
     def finish(self, result: dict[str, Any]) -> None:
         """Write the result, with what produced it."""
-        origin = {
-            "memcomp_lightning": __version__,
-            "torch": torch.__version__,
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        }
+        origin = {"memcomp_lightning": __version__, **_machine()}
         self._write("result.json", {**result, "origin": origin})
         (self.path / "error.json").unlink(missing_ok=True)
 
@@ -112,7 +126,30 @@ class RunFolder:
         write_text(self.path / name, json.dumps(content, indent=1) + "\n")
 
 
-_FREE_TO_CHANGE = ("logger.", "trainer.checkpoint_every", "data.source.data_dir", "data.source.download")
+def _machine() -> dict[str, str]:
+    return {
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+    }
+
+
+def _source() -> str:
+    """Eight digits that stand for every line of the package's code."""
+    root = Path(memcomp_lightning.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+_FREE_TO_CHANGE = (
+    "logger.",
+    "trainer.checkpoint_every",
+    "data.source.data_dir",
+    "data.source.download",
+    "figure.workers",
+)
 """Settings that do not change what is computed."""
 
 

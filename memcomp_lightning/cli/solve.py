@@ -208,7 +208,9 @@ def main() -> None:
     try:
         multirun = is_multirun(sys.argv)
         sys.argv[1:] = [_as_hydra_reads(argument, multirun=multirun) for argument in sys.argv[1:]]
-        check_command_line(sys.argv[1:], config_name="solve", check=prepare, folders=("solve", "solve"))
+        check_command_line(
+            sys.argv[1:], config_name="solve", check=lambda config, _: prepare(config), folders=("solve", "solve")
+        )
         solve()
     except UserError as error:
         refuse(COMMAND, error)

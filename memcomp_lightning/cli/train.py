@@ -5,6 +5,7 @@ import os
 import sys
 import traceback
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
@@ -14,7 +15,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import pipeline, sweep
+from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
@@ -46,8 +47,13 @@ def train(config: DictConfig) -> None:
         log.error("Failed, the sweep goes on: %s", explain(error))
 
 
-def _check(config: DictConfig) -> None:
+def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
+    if config.figure is not None:
+        for part, own in figures.parts(config, overrides).values():
+            check = trajectory.prepare if "curves" not in part.figure else figures.check
+            check(part, own)
+        return
     plan = build(config)
     try:
         trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
@@ -58,6 +64,9 @@ def _check(config: DictConfig) -> None:
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
+    if config.figure is not None:
+        _figure(config, folder, overrides)
+        return
     plan = build(config)
     if _is_first_process():
         folder.open(config, overrides)
@@ -71,6 +80,22 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
         print(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}", flush=True)
+
+
+def _figure(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
+    """Train what a figure needs, and write the report."""
+    folder.open(config, overrides)
+    folder.check_source()
+    try:
+        trained = []
+        for name, (part, own) in figures.parts(config, overrides).items():
+            trained.append(folder.path / name)
+            trained[-1].mkdir(exist_ok=True)
+            train = trajectory.train_trajectory if "curves" not in part.figure else figures.train_curves
+            train(part, own, trained[-1])
+        report.main([*map(str, trained), "--output", str(folder.path / "report.html")])
+    except (KeyboardInterrupt, SystemExit) as stop:
+        raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
 
 
 def _is_first_process() -> bool:

@@ -1,6 +1,13 @@
 """Arrays in, pictures out."""
 
+from memcomp_lightning.plotting.accuracy import plot_against_iterations, plot_against_passes, plot_controls
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 
-__all__ = ["picture_grid", "plot_trajectory"]
+__all__ = [
+    "picture_grid",
+    "plot_against_iterations",
+    "plot_against_passes",
+    "plot_controls",
+    "plot_trajectory",
+]

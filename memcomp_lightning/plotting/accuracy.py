@@ -1,0 +1,169 @@
+"""The paper's Figs. 4 to 6: test accuracy against pretraining iterations or passes, and the controls."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from memcomp_lightning.report.comparison import signed
+from memcomp_lightning.report.results import Results
+from memcomp_lightning.report.verdicts import horizontal_arrow, vertical_arrow
+
+# Okabe and Ito's colours, which colour-blind readers tell apart.
+_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "0.25", "0.55")
+_MARKERS = ("s", "o", "^", "D", "v", "P", "X", "*")
+_LINES = ("--", ":", "-.", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))
+
+
+def plot_against_iterations(results: Results, *, width: float = 6.2, height: float = 3.1) -> Figure:
+    """A panel for each number of passes (Figs. 4 and 5): curves with sigma / sqrt(n), arrows with their lengths.
+
+    Curves with several pretraining lengths are lines; networks without pretraining are level lines.
+
+    Args:
+        results: Of one figure.
+        width: Of a panel, inches.
+        height: Of a panel, inches.
+    """
+    passes = results.plan.passes
+    figure = Figure(figsize=(width, height * len(passes) + 0.5), layout="constrained")
+    panels = figure.subplots(len(passes), 1, sharex=True, squeeze=False)[:, 0]
+    lines = [curve for curve in results.curves if len(results.lengths(curve)) > 1]
+    levels = [
+        curve for curve in results.curves if results.lengths(curve) == [0] and curve not in results.plan.claim
+    ]
+    for letter, axes, done in zip("abcdefgh", panels, passes, strict=False):
+        for number, curve in enumerate(lines):
+            _errorbar(axes, results, curve, number, [(n, done) for n in results.lengths(curve)])
+        for number, curve in enumerate(levels[: len(_LINES)]):
+            mean = results.point(curve, 0, done).mean
+            axes.axhline(mean, color="0.45", lw=1, linestyle=_LINES[number], label=results.label(curve))
+        _arrows(axes, results, done)
+        axes.set(ylabel="test accuracy", title=f"({letter}) {done} back-propagation passes")
+        axes.title.set_size(10)
+        axes.grid(alpha=0.25)
+    panels[-1].set_xlabel("pretraining iterations N of each layer")
+    _finish(figure, results, panels[0])
+    return figure
+
+
+def plot_against_passes(results: Results, *, width: float = 6.8, height: float = 4.6) -> Figure:
+    """Accuracy against fine-tuning passes (Fig. 6), the end of training in the inset.
+
+    Args:
+        results: Of one figure.
+        width: Inches.
+        height: Inches.
+    """
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots()
+    passes = results.plan.passes
+    inset = axes.inset_axes((0.42, 0.12, 0.55, 0.5))
+    for panel, shown in ((axes, passes), (inset, [p for p in passes if p >= passes[-1] / 10])):
+        for number, curve in enumerate(results.curves):
+            _errorbar(
+                panel, results, curve, number, [(results.lengths(curve)[-1], done) for done in shown], by_pass=True
+            )
+        panel.grid(alpha=0.25)
+    ends = [results.point(curve, results.lengths(curve)[-1], passes[-1]).mean for curve in results.curves]
+    middle = float(np.median(ends))
+    inset.set_ylim(middle - 0.025, middle + 0.02)
+    inset.tick_params(labelsize=7)
+    axes.set(xscale="log", xlabel="back-propagation passes", ylabel="test accuracy")
+    _finish(figure, results, axes)
+    return figure
+
+
+def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
+    """Every curve at its last N after each number of passes: mean and standard error, a row each.
+
+    Args:
+        results: Of one figure.
+        width: Inches.
+    """
+    passes = results.plan.passes if len(results.plan.passes) <= 4 else results.plan.passes[-1:]
+    curves = results.curves
+    figure = Figure(figsize=(width, 0.26 * len(curves) + 1.2), layout="constrained")
+    panels = figure.subplots(1, len(passes), sharey=True, squeeze=False)[0]
+    rows = np.arange(len(curves))[::-1]
+    for axes, done in zip(panels, passes, strict=True):
+        for row, curve in zip(rows, curves, strict=True):
+            point = results.point(curve, results.lengths(curve)[-1], done)
+            colour = _COLOURS[results.plan.claim.index(curve)] if curve in results.plan.claim else "0.35"
+            error = None if math.isnan(point.error) else 2 * point.error
+            axes.errorbar(point.mean, row, xerr=error, fmt="o", ms=4, color=colour, capsize=2)
+            if curve in results.plan.claim:
+                axes.axvline(point.mean, color=colour, lw=0.7, alpha=0.6)
+        axes.set_title(f"{done} passes", size=9)
+        axes.grid(alpha=0.25, axis="x")
+        axes.tick_params(labelsize=8)
+    labels = []
+    for curve in curves:
+        last = results.lengths(curve)[-1]
+        labels.append(results.label(curve) + (f", N = {last}" if last else ""))
+    panels[0].set_yticks(rows, labels)
+    figure.supxlabel("test accuracy (mean ± 2 standard errors)", size=9)
+    figure.suptitle(_title(results), size=10)
+    return figure
+
+
+def _errorbar(
+    axes: Axes,
+    results: Results,
+    curve: str,
+    number: int,
+    points: Sequence[tuple[int, int]],
+    *,
+    by_pass: bool = False,
+) -> None:
+    found = [results.point(curve, n, done) for n, done in points]
+    errors = [0.0 if math.isnan(point.error) else point.error for point in found]
+    axes.errorbar(
+        [done if by_pass else n for n, done in points],
+        [point.mean for point in found],
+        errors,
+        color=_COLOURS[number % len(_COLOURS)],
+        marker=_MARKERS[number % len(_MARKERS)],
+        ms=3.5,
+        lw=1.2,
+        elinewidth=0.8,
+        capsize=1.5,
+        label=results.label(curve),
+    )
+
+
+def _arrows(axes: Axes, results: Results, passes: int) -> None:
+    """The paper's two arrows: iterations saved, and accuracy gained at the last N."""
+    first, second = results.plan.claim
+    if first not in results.curves or second not in results.curves:
+        return
+    last = results.lengths(second)[-1]
+    low, high = (results.point(curve, results.lengths(curve)[-1], passes).mean for curve in (first, second))
+    style = {"arrowstyle": "<->", "color": "black", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=(last + 1.2, high), xytext=(last + 1.2, low), arrowprops=style, annotation_clip=False)
+    gap = signed(vertical_arrow(results, passes).effect)
+    axes.annotate(gap, xy=(last + 1.8, (low + high) / 2), va="center", size=8, annotation_clip=False)
+    saved = horizontal_arrow(results, passes)
+    if saved is not None and saved[0] < saved[1]:
+        axes.annotate("", xy=(saved[0], low), xytext=(saved[1], low), arrowprops={**style, "arrowstyle": "->"})
+        axes.annotate(
+            f"{saved[1] - saved[0]} iterations",
+            xy=((saved[0] + saved[1]) / 2, low),
+            xytext=(0, -11),
+            textcoords="offset points",
+            ha="center",
+            size=8,
+        )
+    axes.set_xlim(right=last + 5)
+
+
+def _title(results: Results) -> str:
+    return f"{results.plan.data}: {results.plan.title}\n{results.plan.scale}"
+
+
+def _finish(figure: Figure, results: Results, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.suptitle(_title(results), size=10)

@@ -1,0 +1,37 @@
+"""Networks of one shape side by side on the replica axis."""
+
+import copy
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from torch import nn
+
+from memcomp_lightning.errors import require
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
+    """Return a copy of all ``networks`` as one, with their replicas one after the other on a single axis.
+
+    Args:
+        networks: Of one architecture.
+        replicas: Leading axes of each of them.
+
+    Raises:
+        SettingError: There is none, or names, shapes or numbers of axes differ.
+
+    >>> from memcomp_lightning.models import RBM
+    >>> stacked([RBM(3, 2, replicas=(4,)), RBM(3, 2, replicas=(4,))], (4,)).replicas
+    (8,)
+    """
+    require(len(networks) > 0, "networks", len(networks), "at least one network")
+    whole = copy.deepcopy(networks[0])
+    states = [network.state_dict() for network in networks]
+    shapes = [{name: tuple(x.shape) for name, x in state.items()} for state in states]
+    require(all(shape == shapes[0] for shape in shapes), "networks", shapes, "networks of one shape")
+    for name, tensor in [*whole.named_parameters(), *whole.named_buffers()]:
+        own_axes = tensor.shape[len(replicas) :]
+        tensor.data = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
+    return whole

@@ -1,0 +1,124 @@
+"""The loops of pretraining and fine-tuning on the replica axis.
+
+They do what ``DBNPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and draw for
+draw: a replica here ends with the weights of the run that trains it alone. What they leave out is everything that
+looks at training, which costs more than an update of a small network.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from memcomp_lightning import rng
+from memcomp_lightning.data import Batches
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.models import DBN, RBM
+from memcomp_lightning.modules import DivergedError, OptimizerFactory, score
+from memcomp_lightning.modules.stage import LARGEST_WEIGHT
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
+from memcomp_lightning.types import NegativePhase
+
+
+class Rates(NamedTuple):
+    """How a stage follows its gradient.
+
+    Attributes:
+        optimizer: Builds an optimiser for some parameters; element-wise, so that replicas stay independent.
+        momentum: Momentum of a pass, by its number from 0 (of the layer, in pretraining); None leaves it.
+    """
+
+    optimizer: OptimizerFactory
+    momentum: Callable[[int], float] | None = None
+
+    def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
+        """Set the momentum of a pass."""
+        if self.momentum is not None:
+            for group in optimizer.param_groups:
+                group["momentum"] = self.momentum(iteration)
+
+
+def pretrain(
+    dbn: DBN,
+    batches: Batches,
+    sampler: NegativePhaseSampler[RBM, Any],
+    *,
+    iterations: int,
+    rates: Rates,
+    seed: int = 0,
+) -> None:
+    """Train each RBM of a DBN in place on the mean activations of the layers below it.
+
+    Args:
+        dbn: The network.
+        batches: Its images, with its replica axis.
+        sampler: Supplies the negative phase.
+        iterations: Passes over the training set for each layer, >= 0.
+        rates: Optimiser and momentum of each layer.
+        seed: Of the negative phase.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations, minimum=0)
+    generator = rng.stream(seed, "negative_phase")
+    for layer, rbm in enumerate(dbn):
+        optimizer, state = rates.optimizer(rbm.parameters()), None
+        for iteration in range(iterations):
+            rates.begin_pass(optimizer, iteration)
+            batches.set_epoch(layer * iterations + iteration)
+            negative: NegativePhase[Any] | None = None
+            for batch in batches:
+                with torch.no_grad():
+                    positive = positive_phase(rbm, dbn.visible_of(layer, batch.v))
+                if state is None:
+                    state = sampler.init(rbm, positive.v.shape[-2], generator=generator)
+                if negative is None or sampler.uses_data:
+                    negative = sampler.sample(rbm, state, positive, generator=generator)
+                    state = negative.state
+                (batch.share * contrast(rbm, positive, negative.configurations).sum()).backward()
+                if batch.closes_step:
+                    optimizer.step()
+                    optimizer.zero_grad()
+                    negative = None
+        _check_finite(rbm, f"pretraining, layer {layer + 1}")
+
+
+def finetune(network: nn.Module, batches: Batches, *, iterations: int, rates: Rates) -> Iterator[int]:
+    """Minimise the cross-entropy of a network in place; yield the number of each pass once it is done.
+
+    The network is in evaluation mode while the caller has it, and nothing waits for the device in between.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits.
+        batches: Its images, with its replica axis.
+        iterations: Passes over the training set, >= 1.
+        rates: Optimiser and momentum.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations)
+    optimizer = rates.optimizer(network.parameters())
+    for iteration in range(iterations):
+        network.train()
+        rates.begin_pass(optimizer, iteration)
+        batches.set_epoch(iteration)
+        for batch in batches:
+            (batch.share * score(network(batch.v), batch.label).mean_loss.sum()).backward()
+            if batch.closes_step:
+                optimizer.step()
+                optimizer.zero_grad()
+        network.eval()
+        yield iteration + 1
+    _check_finite(network, "fine-tuning")
+
+
+def _check_finite(module: nn.Module, where: str) -> None:
+    for name, parameter in module.named_parameters():
+        largest = float(parameter.detach().abs().max())
+        if not largest <= LARGEST_WEIGHT:
+            raise DivergedError(f"{where}: {name} has an entry of {largest:g}. Lower the learning rate.")

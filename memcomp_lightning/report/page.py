@@ -1,0 +1,74 @@
+"""One HTML page that opens offline: pictures and tables inside."""
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+from memcomp_lightning.report.verdicts import RULE, Verdict
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+img { max-width: 100%; height: auto; display: block; margin: 1rem 0 }
+table { border-collapse: collapse; display: block; overflow-x: auto }
+td, th { border-bottom: 1px solid #ddd; padding: .3rem .7rem; text-align: left; vertical-align: top }
+td.fails { color: #a33 } td.only { color: #96690a } td.holds { color: #17703c }
+pre, small { color: #555 }
+"""
+
+
+class Section(NamedTuple):
+    """One figure.
+
+    Attributes:
+        title: Above it.
+        pictures: Caption and PNG of each.
+        verdicts: Rows of the table.
+        notes: Lines below: settings, time, where the numbers are.
+    """
+
+    title: str
+    pictures: Sequence[tuple[str, bytes]]
+    verdicts: Sequence[Verdict]
+    notes: Sequence[str]
+
+
+def page(sections: Sequence[Section]) -> str:
+    """Return the page."""
+    body = "\n".join(_section(section) for section in sections)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>memcomp_lightning: report</title><style>{_STYLE}</style></head>\n"
+        f"<body><h1>memcomp_lightning: report</h1>\n{body}\n<h2>How verdicts are made</h2><p>{escape(RULE)}</p>"
+        "</body></html>\n"
+    )
+
+
+def markdown(verdicts: Sequence[Verdict]) -> str:
+    """The table for a README."""
+    lines = ["| claim of the paper | measured | paired difference | verdict |", "| --- | --- | --- | --- |"]
+    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in verdict) + " |" for verdict in verdicts]
+    return "\n".join(lines) + "\n"
+
+
+def _section(section: Section) -> str:
+    pictures = "\n".join(
+        f'<img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+        for caption, png in section.pictures
+    )
+    rows = "\n".join(_row(verdict) for verdict in section.verdicts)
+    table = (
+        f"<table><tr><th>claim of the paper</th><th>measured</th><th>paired difference</th><th>verdict</th></tr>\n"
+        f"{rows}</table>"
+        if rows
+        else ""
+    )
+    notes = "<br>".join(escape(note) for note in section.notes)
+    return f"<h2>{escape(section.title)}</h2>\n{table}\n{pictures}\n<p><small>{notes}</small></p>"
+
+
+def _row(verdict: Verdict) -> str:
+    kind = "holds" if verdict.verdict == "holds" else "only" if verdict.verdict.startswith("holds") else "fails"
+    cells = "".join(f"<td>{escape(cell)}</td>" for cell in verdict[:-1])
+    return f'<tr>{cells}<td class="{kind}">{escape(verdict.verdict)}</td></tr>'

@@ -1,0 +1,132 @@
+"""The records of a figure as curves, points and tables."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from memcomp_lightning.errors import require_choice
+from memcomp_lightning.report.records import Records
+
+
+class Point(NamedTuple):
+    """Mean accuracy over partitions and seeds, and its standard error sigma / sqrt(n) (NaN for a single one)."""
+
+    mean: float
+    error: float
+    n: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a figure shows.
+
+    Attributes:
+        name: "figure4" and so on; begins the names of its files.
+        title: What was trained.
+        data: Name of the data set.
+        against: Axis of the curves, "iterations" or "passes".
+        passes: Fine-tuning passes after which the networks were tested.
+        claim: Names of two curves; the paper says that the second one is better.
+        labels: Names for people, by curve, in the order of the legend.
+        chosen: The setting that is chosen on held-out images, by curve.
+        stop_early: Curves that report the pass of best validation accuracy.
+        scale: Sizes that a reader should know: partitions, training images, seeds.
+    """
+
+    name: str
+    title: str
+    data: str
+    against: str
+    passes: Sequence[int]
+    claim: Sequence[str]
+    labels: Mapping[str, str]
+    chosen: Mapping[str, str]
+    stop_early: Sequence[str]
+    scale: str
+
+    def __post_init__(self) -> None:
+        require_choice("figure.against", self.against, ("iterations", "passes"))
+        for curve in self.claim:
+            require_choice("figure.claim", curve, tuple(self.labels))
+
+
+class Results:
+    """Accuracies of a figure by curve, pretraining iterations, pass, and pair of seed and partition."""
+
+    def __init__(self, plan: Plan, records: Records) -> None:
+        self.plan = plan
+        self.chosen: dict[str, float | None] = {curve: records.best_choice(curve) for curve in plan.labels}
+        self._values: dict[str, dict[int, dict[int, NDArray[np.float64]]]] = {}
+        self.seconds = sum(record.pretrain_s + record.finetune_s for record in records.all)
+        for curve in plan.labels:
+            by_length: dict[int, list[NDArray[np.float64]]] = {}
+            for record in records.of(curve):
+                early = curve in plan.stop_early
+                accuracy = record.at_best_validation() if early else record.score("test_accuracy")
+                by_length.setdefault(record.iterations, []).append(accuracy)
+            if by_length:
+                self._values[curve] = {
+                    n: dict(zip(plan.passes, np.concatenate(parts, axis=1), strict=True))
+                    for n, parts in by_length.items()
+                }
+
+    @cached_property
+    def curves(self) -> list[str]:
+        """Curves of which something was measured, in the order of the legend."""
+        return list(self._values)
+
+    def lengths(self, curve: str) -> list[int]:
+        """Pretraining iterations that were measured."""
+        return sorted(self._values.get(curve, {}))
+
+    def values(self, curve: str, iterations: int, passes: int) -> NDArray[np.float64]:
+        """Test accuracies, ``(n_seeds * n_partitions,)``."""
+        return self._values[curve][iterations][passes]
+
+    def point(self, curve: str, iterations: int, passes: int) -> Point:
+        """Mean and standard error."""
+        values = self.values(curve, iterations, passes)
+        n = len(values)
+        error = float(values.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
+        return Point(float(values.mean()), error, n)
+
+    def label(self, curve: str) -> str:
+        """Name of a curve, with the value that was chosen for it."""
+        value = self.chosen.get(curve)
+        setting = self.plan.chosen.get(curve, "").rpartition(".")[2]
+        return self.plan.labels[curve] + (f" ({setting} = {value:g})" if value is not None else "")
+
+    def table(self) -> str:
+        """Every point as CSV."""
+        rows: list[list[Any]] = [["curve", "label", "iterations", "passes", "mean", "standard_error", "n"]]
+        for curve in self.curves:
+            for iterations in self.lengths(curve):
+                for passes in self.plan.passes:
+                    point = self.point(curve, iterations, passes)
+                    rows.append([curve, self.label(curve), iterations, passes, *point])
+        buffer = io.StringIO()
+        csv.writer(buffer, lineterminator="\n").writerows(rows)
+        return buffer.getvalue()
+
+
+def read_results(folder: Path) -> Results:
+    """Read the folder of a run of a figure.
+
+    Raises:
+        FileNotFoundError: It holds no figure.
+    """
+    path = folder / "figure.json"
+    if not path.exists():
+        raise FileNotFoundError(
+            f"{folder} holds no figure.json: name the folder of a run like memcomp-train experiment=figure4."
+        )
+    return Results(Plan(**json.loads(path.read_text(encoding="utf-8"))), Records(folder))

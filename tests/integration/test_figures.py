@@ -1,0 +1,173 @@
+"""Figures of the paper from the command line: the same numbers as single runs, resumed, reported."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from running import Outcome
+from test_command_line import options
+
+from memcomp_lightning.report import Records
+
+Run = Callable[..., Outcome]
+
+SMALL = [
+    "data=digits",
+    "data.partitions=3",
+    "figure.passes=[1,2]",
+    "figure.seeds=[0]",
+    "figure.workers=1",
+    "solver.max_steps=20",
+    "solver.n_restarts=3",
+]
+NO_CONTROLS = "figure/curves=none"
+
+
+def records(folder: str = "run") -> Records:
+    return Records(Path(folder))
+
+
+def only(found: Records, curve: str, iterations: int) -> Any:
+    (record,) = [r for r in found.of(curve) if r.iterations == iterations]
+    return record
+
+
+SAMPLERS = [name for name in options("sampler") if name not in ("exact", "ground_state")]
+
+
+def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
+    """Every sampler; two lengths and two seeds in one tensor program, the last bits may differ."""
+    curves = [f"+figure.curves.{name}={{label: {name}, overrides: ['sampler={name}']}}" for name in SAMPLERS]
+    outcome = memcomp_train(
+        "experiment=figure4",
+        *SMALL,
+        NO_CONTROLS,
+        "figure.iterations=[1,3]",
+        "figure.seeds=[0,5]",
+        "figure.networks=12",
+        *curves,
+        "hydra.run.dir=run",
+    )
+    assert outcome.status == 0, outcome.err
+    found = records()
+    for name in SAMPLERS:
+        single = memcomp_train(
+            *[o for o in SMALL if not o.startswith("figure")],
+            f"sampler={name}",
+            "pretrain.iterations=3",
+            "finetune.iterations=2",
+            "seed=5",
+            f"hydra.run.dir=single_{name}",
+        )
+        assert single.status == 0, single.err
+        result = json.loads(Path(f"single_{name}/result.json").read_text())
+        (record,) = [r for r in found.of(name) if (r.iterations, r.seed) == (3, 5)]
+        assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+        assert record.scores["test_accuracy"][1] == pytest.approx(result["test_accuracy"], abs=1e-9)
+        (other,) = [r for r in found.of(name) if (r.iterations, r.seed) == (1, 5)]
+        assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
+
+
+@pytest.mark.parametrize("control", [name for name in options("control") if name != "exact"])
+def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train: Run, control: str) -> None:
+    iterations = 0 if control in ("no_pretraining", "gaussian", "xavier_1", "xavier_4", "bn_relu") else 2
+    curve = f"+figure.curves.x={{label: x, overrides: ['control={control}'], iterations: [{iterations}]}}"
+    drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", "figure.claim=[x,x]"]
+    quick = ["solver.n_restarts=3"] + ([] if control in ("descent", "annealing") else ["solver.max_steps=20"])
+    small = [o for o in SMALL if not o.startswith("solver")] + quick
+    outcome = memcomp_train("experiment=figure4", *small, NO_CONTROLS, curve, *drop, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    single = memcomp_train(
+        *[o for o in small if not o.startswith("figure")],
+        f"control={control}",
+        f"pretrain.iterations={iterations}",
+        "finetune.iterations=2",
+        "hydra.run.dir=single",
+    )
+    assert single.status == 0, single.err
+    result = json.loads(Path("single/result.json").read_text())
+    record = only(records(), "x", iterations)
+    assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+
+
+FIGURE = [
+    "experiment=figure4",
+    *SMALL,
+    "figure.iterations=[1,3]",
+    "figure.controls_at=[2]",
+    "~figure.curves.exact",
+    "~figure.curves.annealing",
+    "~figure.curves.descent",
+    "hydra.run.dir=run",
+]
+
+
+def test_a_figure_is_trained_reported_and_resumed(memcomp_train: Run) -> None:
+    outcome = memcomp_train(*FIGURE)
+    assert outcome.status == 0, outcome.err
+    assert "a gap remains at N = 3 (after 2 passes)" in outcome.out
+    for name in (
+        "figure4.png",
+        "figure4.svg",
+        "figure4_controls.png",
+        "figure4.csv",
+        "verdicts.md",
+        "report.html",
+    ):
+        assert Path("run", name).stat().st_size > 0
+    assert any(Path("run").glob("events.out.*"))
+    page = Path("run/report.html").read_text()
+    assert 'src="data:image/png;base64,' in page
+    assert "http" not in page.replace("https://", "http", 0).split("<body>")[1].split("base64")[0]
+    lines = Path("run/records.jsonl").read_text().splitlines()
+    # What was chosen on held-out images is trained anew on all of them.
+    assert {record.choice for record in records().all if record.curve == "pcd_best_rate" and record.choosing} == {
+        0.05, 0.1, 0.2, 0.5, 1.0, 2.0,
+    }  # fmt: skip
+    assert len(records().of("pcd_best_rate")) == 1
+
+    # An interrupted run: some records are missing, and the last line was not finished.
+    Path("run/records.jsonl").write_text("\n".join(lines[:-3]) + "\n" + lines[-1][:40])
+    outcome = memcomp_train("resume=run")
+    assert outcome.status == 0, outcome.err
+    again = Path("run/records.jsonl").read_text().splitlines()
+    assert again[: len(lines) - 3] == lines[:-3]
+
+    def measured(text: list[str]) -> list[Any]:
+        parsed = [json.loads(line) for line in text]
+        return sorted((r["curve"], str(r["choice"]), r["iterations"], r["scores"]["test_loss"]) for r in parsed)
+
+    assert measured(again) == measured(lines)
+
+
+def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> None:
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"]
+    assert memcomp_train(*small).status == 0
+    other = memcomp_train(*small, "pretrain.optimizer.lr=0.3")
+    assert other.status != 0
+    assert "was made with pretrain.optimizer.lr=0.1, not 0.3" in other.err
+    origin = json.loads(Path("run/origin.json").read_text())
+    Path("run/origin.json").write_text(json.dumps({**origin, "source": "0"}))
+    other = memcomp_train(*small)
+    assert other.status != 0
+    assert "Results of different code are never mixed" in other.err
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("+figure.curves.cd1.colour=red", "setting of figure.curves.cd1 = 'colour' is not allowed"),
+        ("figure.claim=[cd1,memqubo]", "figure.claim = 'memqubo'"),
+        ("figure.against=epochs", "figure.against = 'epochs'"),
+        ("+figure.curves.x={label: x, overrides: ['sampler=cdd']}", "cdd"),
+    ],
+)
+def test_wrong_settings_of_a_figure_are_refused_before_training(
+    memcomp_train: Run, override: str, message: str
+) -> None:
+    outcome = memcomp_train("experiment=figure4", *SMALL, override, "hydra.run.dir=run")
+    assert outcome.status != 0
+    assert message in outcome.err
+    assert not Path("run/records.jsonl").exists()
