@@ -27,7 +27,7 @@ from memcomp_lightning.cli.build import Stage, build
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import Classifier, DBNPretraining, evaluate
+from memcomp_lightning.modules import Classifier, DBNPretraining, DivergedError, evaluate
 from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
 from memcomp_lightning.report import Plan, Record, Records
 from memcomp_lightning.types import Batch
@@ -226,6 +226,37 @@ def plan_of(unit: Unit, iterations: int, seed: int) -> stages.Plan:
 
 
 def run_unit(unit: Unit, progress: Progress) -> list[Record]:
+    """Train the networks of a unit; a value that is only tried may diverge, and is then no choice.
+
+    Raises:
+        DivergedError: Naming the curve.
+    """
+    try:
+        return _train_unit(unit, progress)
+    except DivergedError as error:
+        if not unit.choosing:
+            raise DivergedError(f"figure.curves.{unit.curve}: {error}") from error
+        nothing = {name: [[0.0]] * len(unit.passes) for name in ("validation_accuracy", "test_accuracy")}
+        return [_record(unit, n, seed, nothing, 0.0, 0.0) for n, seed in unit.members]
+
+
+def _record(
+    unit: Unit, n: int, seed: int, scores: dict[str, list[list[float]]], pretrain_s: float, finetune_s: float
+) -> Record:
+    return Record(
+        curve=unit.curve,
+        choice=unit.choice,
+        choosing=unit.choosing,
+        iterations=n,
+        seed=seed,
+        passes=list(unit.passes),
+        scores=scores,
+        pretrain_s=pretrain_s,
+        finetune_s=finetune_s,
+    )
+
+
+def _train_unit(unit: Unit, progress: Progress) -> list[Record]:
     """Pretrain each member, fine-tune all of them side by side, test after the passes asked for."""
     begin = time.perf_counter()
     device = _device(unit.config["trainer"]["accelerator"])
@@ -252,20 +283,11 @@ def run_unit(unit: Unit, progress: Progress) -> list[Record]:
     end = time.perf_counter()
     # (n_passes, n_members, n_replicas)
     values = {name: torch.stack(x).view(len(x), n_members, -1).tolist() for name, x in scores.items()}
-    return [
-        Record(
-            curve=unit.curve,
-            choice=unit.choice,
-            choosing=unit.choosing,
-            iterations=n,
-            seed=seed,
-            passes=list(unit.passes),
-            scores={name: [of_pass[member] for of_pass in x] for name, x in values.items()},
-            pretrain_s=(middle - begin) / n_members,
-            finetune_s=(end - middle) / n_members,
-        )
-        for member, (n, seed) in enumerate(unit.members)
-    ]
+    found = []
+    for member, (n, seed) in enumerate(unit.members):
+        own = {name: [of_pass[member] for of_pass in x] for name, x in values.items()}
+        found.append(_record(unit, n, seed, own, (middle - begin) / n_members, (end - middle) / n_members))
+    return found
 
 
 def pretrained(plan: stages.Plan, seed: int, device: torch.device) -> stages.Plan:

@@ -16,9 +16,10 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.modules import DivergedError, OptimizerFactory, score
+from memcomp_lightning.modules import DivergedError, OptimizerFactory
 from memcomp_lightning.modules.stage import LARGEST_WEIGHT
 from memcomp_lightning.objective import contrast
+from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
 from memcomp_lightning.types import NegativePhase
 
@@ -102,13 +103,13 @@ def finetune(network: nn.Module, batches: Batches, *, iterations: int, rates: Ra
         DivergedError: A parameter left the finite numbers.
     """
     require_count("iterations", iterations)
-    optimizer = rates.optimizer(network.parameters())
+    optimizer, add_gradient = rates.optimizer(network.parameters()), gradient_of(network)
     for iteration in range(iterations):
         network.train()
         rates.begin_pass(optimizer, iteration)
         batches.set_epoch(iteration)
         for batch in batches:
-            (batch.share * score(network(batch.v), batch.label).mean_loss.sum()).backward()
+            add_gradient(batch)
             if batch.closes_step:
                 optimizer.step()
                 optimizer.zero_grad()

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from running import Outcome
 from test_command_line import options
 
+from memcomp_lightning.cli import report
 from memcomp_lightning.report import Records
 
 Run = Callable[..., Outcome]
@@ -171,3 +173,69 @@ def test_wrong_settings_of_a_figure_are_refused_before_training(
     assert outcome.status != 0
     assert message in outcome.err
     assert not Path("run/records.jsonl").exists()
+
+
+TINY = [
+    "data=digits",
+    "++figure.passes=[1,2]",
+    "++figure.iterations=[1,2]",
+    "++figure.controls_at=[1]",
+    "++figure.seeds=[0]",
+    "++figure.workers=1",
+    "solver.max_steps=20",
+    "solver.n_restarts=3",
+    "preset=quick",
+    "hydra.run.dir=run",
+]
+
+
+def test_all_figures_end_in_one_report(memcomp_train: Run) -> None:
+    outcome = memcomp_train("experiment=all_figures", *TINY)
+    assert outcome.status == 0, outcome.err
+    page = Path("run/report.html").read_text()
+    for figure in ("figure2", "figure4", "figure5", "figure6"):
+        assert Path("run", figure, f"{figure}.svg").stat().st_size > 0
+        assert f"<h2>{figure}: digits" in page
+    assert {record.seed for record in records("run/figure5").all} == {0}
+    assert [len(record.scores["test_loss"][0]) for record in records("run/figure4").of("cd1")] == [3, 3]
+
+
+def test_report_of_existing_folders(memcomp_train: Run, capfd: pytest.CaptureFixture[str]) -> None:
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"]
+    assert memcomp_train(*small).status == 0
+    Path("run/figure4.png").unlink()
+    report.main(["run", "--output", "page.html"])
+    assert Path("run/figure4.png").exists()
+    assert "figure4" in Path("page.html").read_text()
+    with pytest.raises(SystemExit):
+        report.main(["elsewhere"])
+    assert "elsewhere holds no figure.json" in capfd.readouterr().err
+
+
+def test_figures_train_in_processes_of_their_own(memcomp_train: Run) -> None:
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1,2]", "figure.networks=3"]
+    assert memcomp_train(*small, "hydra.run.dir=here").status == 0
+    assert memcomp_train(*small, "figure.workers=2", "hydra.run.dir=apart").status == 0
+
+    def losses(folder: str) -> dict[Any, Any]:
+        return {record.key: record.scores["test_loss"] for record in records(folder).all}
+
+    here, apart = losses("here"), losses("apart")
+    assert here.keys() == apart.keys()
+    for key, expected in here.items():
+        assert torch.tensor(apart[key]).allclose(torch.tensor(expected), rtol=1e-5)
+
+
+def test_a_value_that_diverges_is_not_chosen_and_a_curve_that_does_is_named(memcomp_train: Run) -> None:
+    curve = (
+        "+figure.curves.x={label: x, overrides: ['sampler=cd'], iterations: [1], "
+        "choose: {setting: pretrain.optimizer.lr, values: %s}}"
+    )
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "~figure.curves.cd1", "~figure.curves.mem_qubo"]
+    small.append("figure.claim=[x,x]")
+    outcome = memcomp_train(*small, curve % "[1e30,0.1]", "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert records().best_choice("x") == 0.1
+    outcome = memcomp_train(*small, curve % "[1e30]", "hydra.run.dir=other")
+    assert outcome.status != 0
+    assert "figure.curves.x: pretraining, layer 1: weight has an entry of" in outcome.err

@@ -1,0 +1,74 @@
+"""The gradient in closed form against autograd, and networks side by side against networks alone."""
+
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian
+from memcomp_lightning.modules import DBNClassifier, score
+from memcomp_lightning.replicas import stacked
+from memcomp_lightning.replicas.backprop import gradient_of
+from memcomp_lightning.types import Batch
+
+
+def classifier(replicas, units="sigmoid", seed=0):
+    generator = rng.stream(seed, "weights")
+    dbn = DBN(7, [5, 3], replicas=replicas, weight_init=Gaussian(std=1.0), generator=generator)
+    made = DBNClassifier(dbn, n_classes=11, units=units, output_init=Gaussian(std=1.0), generator=generator)
+    return made.network.double()
+
+
+def batch(replicas, n=13, share=0.7):
+    v = rng.uniform((*replicas, n, 7), generator=rng.stream(0, "v")).double()
+    label = (rng.uniform((*replicas, n), generator=rng.stream(0, "label")) * 11).long()
+    return Batch(v, label, share, True)
+
+
+@pytest.mark.parametrize("replicas", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("kind", ["sigmoid", "batch_norm_relu", "baseline"])
+def test_gradient_is_that_of_the_mean_cross_entropy(kind, replicas):
+    def network():
+        if kind == "baseline":
+            made = BatchNormReluNetwork(7, [5, 3], 11, replicas=replicas, weight_init=Gaussian(std=1.0))
+            return made.double()
+        return classifier(replicas, kind)
+
+    data, quick, slow = batch(replicas), network(), network()
+    add = gradient_of(quick)
+    add(data)
+    add(data)  # chunks add up
+    loss = data.share * score(slow(data.v), data.label).mean_loss.sum()
+    (2 * loss).backward()
+    for (name, p), q in zip(quick.named_parameters(), slow.parameters(), strict=True):
+        assert (p.grad is None) == (q.grad is None), name
+        if q.grad is not None:
+            torch.testing.assert_close(p.grad, q.grad, rtol=1e-12, atol=1e-13, msg=name)
+
+
+def test_closed_form_is_taken_for_sigmoid_networks_alone():
+    assert "sigmoid" in gradient_of(classifier((2,))).func.__name__
+    assert "autograd" in gradient_of(classifier((2,), "batch_norm_relu")).func.__name__
+    assert "autograd" in gradient_of(BatchNormReluNetwork(7, [5], 11)).func.__name__
+
+
+@pytest.mark.parametrize("units", ["sigmoid", "batch_norm_relu"])
+@pytest.mark.parametrize("replicas", [(), (2,)])
+def test_stacked_networks_answer_as_each_alone(replicas, units):
+    alone = [classifier(replicas, units, seed) for seed in (3, 5, 8)]
+    together = stacked(alone, replicas)
+    for network in (*alone, together):
+        network.eval()
+    data = batch(replicas)
+    n_replicas = 3 * (replicas[0] if replicas else 1)
+    v = torch.stack([data.v] * 3).reshape(n_replicas, *data.v.shape[-2:])
+    expected = torch.stack([network(data.v) for network in alone])
+    torch.testing.assert_close(together(v), expected.reshape(n_replicas, 13, 11), rtol=1e-12, atol=1e-13)
+    with torch.no_grad():
+        next(together.parameters()).zero_()
+    assert next(alone[0].parameters()).abs().max() > 0
+
+
+def test_stacking_refuses_other_shapes():
+    with pytest.raises(SettingError, match="networks of one shape"):
+        stacked([classifier((2,)), classifier((3,))], (2,))
