@@ -64,7 +64,8 @@ def save(folder: Path, name: str, figure: Figure) -> bytes:
 def verdict_table(folder: Path) -> str:
     """The verdicts of a folder, for the screen."""
     rows = [["claim", "measured", "paired difference", "verdict"]]
-    rows += [list(verdict) for verdict in verdicts(read_results(folder))]
+    for claim, measured, test, verdict, controls in verdicts(read_results(folder)):
+        rows.append([claim, measured, test, verdict + (f" ({len(controls)})" if controls else "")])
     return aligned(rows) if len(rows) > 1 else ""
 
 

@@ -17,7 +17,7 @@ _MARKERS = ("s", "o", "^", "D", "v", "P", "X", "*")
 _LINES = ("--", ":", "-.", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))
 
 
-def plot_against_iterations(results: Results, *, width: float = 6.2, height: float = 3.1) -> Figure:
+def plot_against_iterations(results: Results, *, width: float = 7.2, height: float = 3.1) -> Figure:
     """A panel for each number of passes (Figs. 4 and 5): curves with sigma / sqrt(n), arrows with their lengths.
 
     Curves with several pretraining lengths are lines; networks without pretraining are level lines.
@@ -39,7 +39,8 @@ def plot_against_iterations(results: Results, *, width: float = 6.2, height: flo
             _errorbar(axes, results, curve, number, [(n, done) for n in results.lengths(curve)])
         for number, curve in enumerate(levels[: len(_LINES)]):
             mean = results.point(curve, 0, done).mean
-            axes.axhline(mean, color="0.45", lw=1, linestyle=_LINES[number], label=results.label(curve))
+            colour = _COLOURS[(len(lines) + number) % len(_COLOURS)]
+            axes.axhline(mean, color=colour, lw=1.1, linestyle=_LINES[number], label=results.label(curve))
         _arrows(axes, results, done)
         axes.set(ylabel="test accuracy", title=f"({letter}) {done} back-propagation passes")
         axes.title.set_size(10)
@@ -156,7 +157,7 @@ def _arrows(axes: Axes, results: Results, passes: int) -> None:
             ha="center",
             size=8,
         )
-    axes.set_xlim(right=last + 5)
+    axes.set_xlim(right=last + 6)
 
 
 def _title(results: Results) -> str:
@@ -165,5 +166,5 @@ def _title(results: Results) -> str:
 
 def _finish(figure: Figure, results: Results, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=7.5, frameon=False)
     figure.suptitle(_title(results), size=10)

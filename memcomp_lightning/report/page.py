@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
 
-from memcomp_lightning.report.verdicts import RULE, Verdict
+from memcomp_lightning.report.verdicts import HOLDS, ONLY, RULE, Verdict
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
@@ -15,6 +15,9 @@ td, th { border-bottom: 1px solid #ddd; padding: .3rem .7rem; text-align: left; 
 td.fails { color: #a33 } td.only { color: #96690a } td.holds { color: #17703c }
 pre, small { color: #555 }
 """
+
+
+_HEADER = ("claim of the paper", "measured", "paired difference", "verdict", "controls that explain it")
 
 
 class Section(NamedTuple):
@@ -47,8 +50,10 @@ def page(sections: Sequence[Section]) -> str:
 
 def markdown(verdicts: Sequence[Verdict]) -> str:
     """The table for a README."""
-    lines = ["| claim of the paper | measured | paired difference | verdict |", "| --- | --- | --- | --- |"]
-    lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in verdict) + " |" for verdict in verdicts]
+    lines = [f"| {' | '.join(_HEADER)} |", "| --- | --- | --- | --- | --- |"]
+    for verdict in verdicts:
+        cells = [*verdict[:-1], "; ".join(verdict.explained_by)]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -58,17 +63,13 @@ def _section(section: Section) -> str:
         for caption, png in section.pictures
     )
     rows = "\n".join(_row(verdict) for verdict in section.verdicts)
-    table = (
-        f"<table><tr><th>claim of the paper</th><th>measured</th><th>paired difference</th><th>verdict</th></tr>\n"
-        f"{rows}</table>"
-        if rows
-        else ""
-    )
+    table = f"<table><tr>{''.join(f'<th>{name}</th>' for name in _HEADER)}</tr>\n{rows}</table>" if rows else ""
     notes = "<br>".join(escape(note) for note in section.notes)
     return f"<h2>{escape(section.title)}</h2>\n{table}\n{pictures}\n<p><small>{notes}</small></p>"
 
 
 def _row(verdict: Verdict) -> str:
-    kind = "holds" if verdict.verdict == "holds" else "only" if verdict.verdict.startswith("holds") else "fails"
-    cells = "".join(f"<td>{escape(cell)}</td>" for cell in verdict[:-1])
-    return f'<tr>{cells}<td class="{kind}">{escape(verdict.verdict)}</td></tr>'
+    kind = {HOLDS: "holds", ONLY: "only"}.get(verdict.verdict, "fails")
+    cells = "".join(f"<td>{escape(cell)}</td>" for cell in verdict[:3])
+    controls = "<br>".join(escape(control) for control in verdict.explained_by)
+    return f'<tr>{cells}<td class="{kind}">{escape(verdict.verdict)}</td><td>{controls}</td></tr>'

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from memcomp_lightning.report.comparison import Comparison, compare
 from memcomp_lightning.report.results import Results
 
-HOLDS, FAILS = "holds", "does not hold"
+HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
 
 RULE = (
     "A claim holds if the paired difference is positive with p < .05 (two-sided t test over partitions and "
@@ -24,13 +24,15 @@ class Verdict(NamedTuple):
         claim: The paper's, in one sentence.
         measured: Numbers.
         test: Paired difference, interval, p value.
-        verdict: Holds, does not hold, or holds only without which controls.
+        verdict: Holds, does not hold, or holds only without some controls.
+        explained_by: These controls.
     """
 
     claim: str
     measured: str
     test: str
     verdict: str
+    explained_by: tuple[str, ...] = ()
 
 
 def verdicts(results: Results) -> list[Verdict]:
@@ -82,7 +84,7 @@ def _iterations_claims(results: Results) -> list[Verdict]:
                 f"{names[second]} needs fewer pretraining iterations than {names[first]} ({after})",
                 f"N = {arrow[0]} instead of {arrow[1]} for {goal.mean:.3f}" if arrow else f"never {goal.mean:.3f}",
                 "",
-                _without(results, free) if saved else FAILS,
+                *_verdict(results, saved, free),
             )
         )
         gain = vertical_arrow(results, passes)
@@ -92,7 +94,7 @@ def _iterations_claims(results: Results) -> list[Verdict]:
                 f"a gap remains at N = {last} ({after})",
                 f"{a.mean:.3f} ± {a.error:.3f} against {b.mean:.3f} ± {b.error:.3f}",
                 str(gain),
-                _without(results, explaining(results, passes, gain)) if gain.is_gain else FAILS,
+                *_verdict(results, gain.is_gain, explaining(results, passes, gain)),
             )
         )
     return found
@@ -114,19 +116,19 @@ def _passes_claims(results: Results) -> list[Verdict]:
             f"{names[second]} is more than 1 % above {names[first]} (after {passes} passes)",
             measured,
             str(gain),
-            _without(results, by_control) if gain.is_gain and gain.low > 0.01 else FAILS,
+            *_verdict(results, gain.is_gain and gain.low > 0.01, by_control),
         ),
         Verdict(
             f"{names[second]} makes 20 % fewer errors (after {passes} passes)",
             f"{100 * fewer:.1f} % fewer errors" if fewer >= 0 else f"{-100 * fewer:.1f} % more errors",
             "",
-            _without(results, by_control) if gain.is_gain and fewer >= 0.2 else FAILS,
+            *_verdict(results, gain.is_gain and fewer >= 0.2, by_control),
         ),
         Verdict(
             f"{names[second]} (after {passes} passes) is above {names[first]} at its best pass ({best})",
             f"{a.mean:.4f} against {results.point(first, results.lengths(first)[-1], best).mean:.4f}",
             str(at_best),
-            _without(results, by_control) if at_best.is_gain else FAILS,
+            *_verdict(results, at_best.is_gain, by_control),
         ),
     ]
 
@@ -145,7 +147,7 @@ def explaining(results: Results, passes: int, gain: Comparison) -> list[str]:
     return found
 
 
-def _without(results: Results, controls: list[str]) -> str:
-    if not controls:
-        return HOLDS
-    return "holds only without: " + "; ".join(results.plan.labels[curve] for curve in controls)
+def _verdict(results: Results, holds: bool, controls: list[str]) -> tuple[str, tuple[str, ...]]:
+    if not holds:
+        return FAILS, ()
+    return (ONLY, tuple(results.plan.labels[curve] for curve in controls)) if controls else (HOLDS, ())
