@@ -1,6 +1,9 @@
 """Figures of the paper from the command line: the same numbers as single runs, resumed, reported."""
 
 import json
+import signal
+import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -239,3 +242,38 @@ def test_a_value_that_diverges_is_not_chosen_and_a_curve_that_does_is_named(memc
     outcome = memcomp_train(*small, curve % "[1e30]", "hydra.run.dir=other")
     assert outcome.status != 0
     assert "figure.curves.x: pretraining, layer 1: weight has an entry of" in outcome.err
+
+
+def test_processes_end_with_the_one_that_started_them(start_process: Callable[..., Any], tmp_path: Path) -> None:
+    """Ctrl-C is answered with how to go on; a killed run leaves nothing that computes."""
+    forever = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1,2]", "figure.passes=[100000]"]
+    forever += ["figure.workers=2", "figure.networks=3", "hydra.run.dir=run"]
+    for stop in (signal.SIGINT, signal.SIGKILL):
+        process = start_process(*forever)
+        children = _wait_for(lambda process=process: _training_children(process.pid), 2)
+        process.send_signal(stop)
+        _, err = process.communicate(timeout=60)
+        assert stop == signal.SIGKILL or "Go on with: memcomp-train resume=run" in err
+        _wait_for(lambda children=children: [pid for pid in range(2) if not _alive(children[pid])], 2)
+
+
+def _training_children(parent: int) -> list[int]:
+    """Child processes that have used a few seconds of processor time."""
+    found = subprocess.run(
+        ["ps", "-ww", "-o", "pid=,cputimes=,args=", "--ppid", str(parent)], capture_output=True, text=True
+    )
+    rows = [line.split(maxsplit=2) for line in found.stdout.splitlines()]
+    return [int(pid) for pid, seconds, command in rows if "spawn_main" in command and int(seconds) >= 3]
+
+
+def _alive(pid: int) -> bool:
+    found = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout.strip()
+    return bool(found) and not found.startswith("Z")
+
+
+def _wait_for(look: Callable[[], list[int]], n: int) -> list[int]:
+    for _ in range(240):
+        if len(found := look()) >= n:
+            return found
+        time.sleep(0.25)
+    raise AssertionError(f"waited a minute, there are {found}")
