@@ -1,0 +1,221 @@
+"""Networks of a figure, and their training side by side."""
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks import MomentumSchedule
+from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import Classifier, DBNPretraining, DivergedError, evaluate
+from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
+from memcomp_lightning.report import Record
+from memcomp_lightning.types import Batch
+
+Progress = Callable[[str, int], None]
+"""Takes what is being done, and how many network updates were done since the last call."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """A network of a curve, with its replicas.
+
+    Attributes:
+        curve: Name of the curve.
+        config: Settings as plain values.
+        iterations: Of pretraining.
+        seed: Of weights, chains and order.
+        choice: Value of the setting that is being chosen, or has been.
+        choosing: Whether it is trained for the choice; it is judged on held-out training images.
+    """
+
+    curve: str
+    config: dict[str, Any]
+    iterations: int
+    seed: int
+    choice: float | None
+    choosing: bool
+
+    @property
+    def fine_tuning(self) -> str:
+        """What networks must share to be fine-tuned as one program."""
+        config = self.config
+        shared = {name: config[name] for name in ("data", "finetune", "trainer")}
+        shared["momentum"] = config["callbacks"]["finetune"].get("momentum_schedule")
+        shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
+        return json.dumps(shared, sort_keys=True)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Networks that are fine-tuned as one tensor program.
+
+    Attributes:
+        members: The networks; what :attr:`Member.fine_tuning` says is the same for all.
+        passes: Fine-tuning passes after which they are tested.
+        n_updates: Network updates, of all replicas.
+    """
+
+    members: tuple[Member, ...]
+    passes: tuple[int, ...]
+    n_updates: int
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        first, more = self.members[0], len(self.members) - 1
+        what = f"choosing, {first.choice:g}" if first.choosing else f"N = {first.iterations}"
+        return f"{first.curve}, {what}" + (f" and {more} more" if more else "")
+
+
+def plan_of(member: Member, n_passes: int) -> Plan:
+    """The stages of a member, as the command line would build them for it alone."""
+    config = OmegaConf.create(member.config)
+    config.pretrain.iterations, config.seed = member.iterations, member.seed
+    config.finetune.iterations = n_passes
+    return build(config)
+
+
+def run_unit(unit: Unit, progress: Progress) -> list[Record]:
+    """Pretrain each member, fine-tune all of them side by side, test after the passes asked for.
+
+    A value that is only tried may diverge: it is then no choice.
+
+    Raises:
+        DivergedError: Naming the curve.
+    """
+    device = device_of(unit.members[0].config["trainer"]["accelerator"])
+    members, plans, pretrain_s, found = [], [], [], []
+    for number, member in enumerate(unit.members):
+        progress(f"{unit.title}, pretraining {number + 1} of {len(unit.members)}", 0)
+        begin = time.perf_counter()
+        try:
+            plan = pretrained(plan_of(member, unit.passes[-1]), member.seed, device)
+        except DivergedError as error:
+            if not member.choosing:
+                raise DivergedError(f"figure.curves.{member.curve}: {error}") from error
+            nothing = {f"{name}_accuracy": [[0.0]] * len(unit.passes) for name in ("test", "validation")}
+            found.append(_record(member, unit, nothing, time.perf_counter() - begin, 0.0))
+            continue
+        members.append(member)
+        plans.append(plan)
+        pretrain_s.append(time.perf_counter() - begin)
+    if not members:
+        return found
+    begin = time.perf_counter()
+    try:
+        scores = _fine_tuned(plans, members, unit, progress, device)
+    except DivergedError as error:
+        curves = ", ".join(dict.fromkeys(member.curve for member in members))
+        raise DivergedError(f"figure.curves.{curves}: {error}") from error
+    finetune_s = (time.perf_counter() - begin) / len(members)
+    for number, member in enumerate(members):
+        own = {name: [of_pass[number] for of_pass in values] for name, values in scores.items()}
+        found.append(_record(member, unit, own, pretrain_s[number], finetune_s))
+    return found
+
+
+def _fine_tuned(
+    plans: Sequence[Plan], members: Sequence[Member], unit: Unit, progress: Progress, device: torch.device
+) -> dict[str, list[list[list[float]]]]:
+    """Scores by name, pass, member and replica."""
+    stage = tuning(plans[0])
+    n_members, replicas = len(plans), stage.data.replicas
+    network = stacked([_classifier(plan).network for plan in plans], replicas).to(device)
+    batches = stage.data.train_batches(0, 1).repeated([member.seed for member in members]).to(device)
+    tests = {"test": stage.data.test, "validation": stage.data.validation}
+    images = {name: _side_by_side(*held, n_members, replicas, device) for name, held in tests.items() if held}
+    scores: dict[str, list[Tensor]] = {f"{name}_{what}": [] for name in images for what in ("accuracy", "loss")}
+    n_updates = len(batches) * n_members * math.prod(replicas)
+    try:
+        for done in finetune(network, batches, iterations=unit.passes[-1], rates=rates_of(stage)):
+            progress(f"{unit.title}, pass {done} of {unit.passes[-1]}", n_updates)
+            if done in unit.passes:
+                for name, batch in images.items():
+                    score = evaluate(network, [batch])
+                    scores[f"{name}_accuracy"].append(score.accuracy)
+                    scores[f"{name}_loss"].append(score.mean_loss)
+    except DivergedError:
+        # Found at the end, when all is tested: what diverged is at chance.
+        if not members[0].choosing:
+            raise
+    return {name: torch.stack(x).view(len(x), n_members, -1).tolist() for name, x in scores.items()}
+
+
+def _record(
+    member: Member, unit: Unit, scores: dict[str, list[list[float]]], pretrain_s: float, finetune_s: float
+) -> Record:
+    return Record(
+        curve=member.curve,
+        choice=member.choice,
+        choosing=member.choosing,
+        iterations=member.iterations,
+        seed=member.seed,
+        passes=list(unit.passes),
+        scores=scores,
+        pretrain_s=pretrain_s,
+        finetune_s=finetune_s,
+    )
+
+
+def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
+    """Train the DBN of a plan, and change it as the control says."""
+    network = plan.network.to(device)
+    if plan.pretraining is not None:
+        stage = plan.pretraining
+        module = stage.module
+        assert isinstance(module, DBNPretraining)
+        pretrain(
+            module.dbn,
+            stage.data.train_batches(0, 1).to(device),
+            module.sampler,
+            iterations=module.iterations,
+            rates=rates_of(stage),
+            seed=seed,
+        )
+    if plan.between is not None and isinstance(network, DBN):
+        plan.between(network, generator=rng.stream(seed, "between stages"))
+    return plan
+
+
+def rates_of(stage: Stage) -> Rates:
+    """Optimiser and momentum of a stage."""
+    schedules = [callback for callback in stage.callbacks if isinstance(callback, MomentumSchedule)]
+    return Rates(stage.module.make_optimizer, schedules[0].momentum if schedules else None)
+
+
+def tuning(plan: Plan) -> Stage:
+    """The last stage, which every network of a figure has."""
+    assert plan.finetuning is not None
+    return plan.finetuning
+
+
+def _classifier(plan: Plan) -> Classifier:
+    module = tuning(plan).module
+    assert isinstance(module, Classifier)
+    return module
+
+
+def _side_by_side(
+    v: Tensor, label: Tensor, n_members: int, replicas: tuple[int, ...], device: torch.device
+) -> Batch:
+    """Images for all members; what all replicas share is not copied."""
+    v, label = v.to(device), label.to(device)
+    if label.ndim == 1:
+        n_networks = n_members * math.prod(replicas)
+        return Batch(v.expand(n_networks, -1, -1), label.expand(n_networks, -1), 1.0, True)
+    return Batch(v.repeat(n_members, 1, 1), label.repeat(n_members, 1), 1.0, True)
+
+
+def device_of(accelerator: str) -> torch.device:
+    """Where networks train, from the trainer's setting."""
+    use_gpu = accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available()
+    return torch.device("cuda" if use_gpu else "cpu")

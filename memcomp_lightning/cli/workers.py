@@ -1,0 +1,102 @@
+"""Processes that train the networks of a figure."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+
+from memcomp_lightning.cli.units import Progress, Unit, device_of, run_unit
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.report import Record
+
+
+def _n_cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+Runner = Callable[[Sequence[Unit], Progress], Iterator[list[Record]]]
+
+
+@contextmanager
+def runner(config: DictConfig) -> Iterator[Runner]:
+    """What trains units: this process, or as many others as there are cores, each on one thread."""
+    workers = config.figure.workers
+    if workers is None:
+        workers = 1 if device_of(config.trainer.accelerator).type != "cpu" else _n_cores()
+    require_count("figure.workers", workers)
+    if workers == 1:
+        yield _run_here
+        return
+    context = multiprocessing.get_context("spawn")
+    messages = context.SimpleQueue()
+    pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker, initargs=(messages,))
+    try:
+        yield partial(_run_in_pool, pool, messages)
+    except BaseException:
+        for process in list(pool._processes.values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _run_here(units: Sequence[Unit], progress: Progress) -> Iterator[list[Record]]:
+    for unit in units:
+        yield run_unit(unit, progress)
+
+
+def _run_in_pool(
+    pool: ProcessPoolExecutor, messages: Any, units: Sequence[Unit], progress: Progress
+) -> Iterator[list[Record]]:
+    running = {pool.submit(_run_in_worker, unit) for unit in units}
+    while running:
+        done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+        while not messages.empty():
+            progress(*messages.get())
+        for future in done:
+            yield future.result()
+
+
+_messages: Any = None
+"""Where a worker process says what it is doing."""
+
+
+def _begin_worker(messages: Any) -> None:
+    global _messages
+    _messages = messages
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    torch.set_num_threads(1)
+
+
+def _end_with_parent() -> None:
+    """A first process that is killed cannot end the others."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _run_in_worker(unit: Unit) -> list[Record]:
+    last, waiting = time.monotonic(), 0
+
+    def report(what: str, n_updates: int) -> None:
+        nonlocal last, waiting
+        waiting += n_updates
+        if time.monotonic() - last > 0.2:
+            _messages.put((what, waiting))
+            last, waiting = time.monotonic(), 0
+
+    records = run_unit(unit, report)
+    _messages.put((unit.title, waiting))
+    return records
