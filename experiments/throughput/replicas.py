@@ -4,8 +4,10 @@ python experiments/throughput/replicas.py          # two minutes on one core
 """
 
 import argparse
+import logging
 import statistics
 import time
+import warnings
 from functools import partial
 
 import lightning.pytorch as pl
@@ -73,6 +75,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     given = parser.parse_args()
     torch.set_num_threads(1)
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
     everything = images()
     print(f"{'networks in a stack':>28}  {'us an update of one':>20}  {'Fig. 4 on two cores, min':>25}")
     for n_replicas in (1, 10, 20, 40, 100):
