@@ -8,7 +8,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 import torch.distributed
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 from torch.nn import Parameter
 from torch.optim import SGD, Optimizer
 
@@ -23,6 +23,15 @@ LARGEST_WEIGHT = 1e15
 
 class DivergedError(ValueError):
     """Training left the finite numbers; which tensor, where, and what to do."""
+
+
+def diverged_parameter(module: nn.Module) -> str | None:
+    """Say which parameter left the finite numbers, and how far; None if none did."""
+    for name, parameter in module.named_parameters():
+        largest = float(parameter.detach().abs().max())
+        if not largest <= LARGEST_WEIGHT:
+            return f"{name} has an entry of {largest:g}"
+    return None
 
 
 PAPER_SGD: OptimizerFactory = partial(SGD, lr=0.1)
@@ -110,13 +119,11 @@ class StageModule(pl.LightningModule):
 
     def _check_finite(self) -> None:
         """Stop before the pass's checkpoint is written, so that the last good one stays."""
-        for name, parameter in self.named_parameters():
-            largest = float(parameter.detach().abs().max())
-            if not largest <= LARGEST_WEIGHT:
-                raise DivergedError(
-                    f"{self.progress}: training diverged, {name} has an entry of {largest:g}. Lower the learning "
-                    f"rate ({self.stage}.optimizer.lr) and start a new run."
-                )
+        if (diverged := diverged_parameter(self)) is not None:
+            raise DivergedError(
+                f"{self.progress}: training diverged, {diverged}. Lower the learning rate "
+                f"({self.stage}.optimizer.lr) and start a new run."
+            )
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Parameters that the present loss does not depend on."""

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require_count
@@ -38,10 +38,7 @@ class AlternatingDescent:
         moving = torch.ones(shape[:-1], dtype=torch.bool, device=x.device)
         for _ in range(self.max_sweeps):
             before = x.clone()
-            for block in qubo.graph.blocks():
-                field = qubo.field(x)[..., block]
-                # A tie keeps its value, so that equal energies cannot alternate for ever.
-                x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))
+            descend(qubo, x)
             steps += moving
             moving = (x != before).any(-1)
             if not bool(moving.any()):
@@ -54,3 +51,11 @@ class AlternatingDescent:
             steps=steps,
             wall_time_s=time.perf_counter() - begin,
         )
+
+
+def descend(qubo: Qubo, x: Tensor) -> None:
+    """Set each block of ``x`` in turn to its optimum given the rest, in place."""
+    for block in qubo.graph.blocks():
+        field = qubo.field(x)[..., block]
+        # A tie keeps its value, so that equal energies cannot alternate for ever.
+        x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))

@@ -8,6 +8,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.qubo.alternating_descent import descend
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status
 
 
@@ -43,17 +44,15 @@ class GibbsAnnealing:
         begin = time.perf_counter()
         shape = (*qubo.problems, self.n_restarts, qubo.n)
         x = (rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5).to(qubo.linear.dtype)
-        blocks = list(qubo.graph.blocks())
+        blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
         per_scale = torch.logspace(0, 1, self.n_sweeps, base=self.beta_last / self.beta_first, dtype=torch.float64)
         for beta in (self.beta_first * per_scale).tolist():
-            beta_here = (beta / _scale(qubo)).to(x.dtype)[..., None, None]
+            beta_here = (beta / scale).to(x.dtype)[..., None, None]
             for block in blocks:
                 p = torch.sigmoid(-beta_here * qubo.field(x)[..., block])
                 x[..., block] = rng.bernoulli(p, generator=generator)
         for _ in range(_DESCENTS):
-            for block in blocks:
-                field = qubo.field(x)[..., block]
-                x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))
+            descend(qubo, x)
         ones = torch.ones(shape[:-1], dtype=torch.int64, device=x.device)
         return QuboSolution(
             assignments=x,

@@ -17,7 +17,7 @@ from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules import DivergedError, OptimizerFactory
-from memcomp_lightning.modules.stage import LARGEST_WEIGHT
+from memcomp_lightning.modules.stage import diverged_parameter
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
@@ -119,7 +119,5 @@ def finetune(network: nn.Module, batches: Batches, *, iterations: int, rates: Ra
 
 
 def _check_finite(module: nn.Module, where: str) -> None:
-    for name, parameter in module.named_parameters():
-        largest = float(parameter.detach().abs().max())
-        if not largest <= LARGEST_WEIGHT:
-            raise DivergedError(f"{where}: {name} has an entry of {largest:g}. Lower the learning rate.")
+    if (diverged := diverged_parameter(module)) is not None:
+        raise DivergedError(f"{where}: {diverged}. Lower the learning rate.")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.files import write_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +71,7 @@ class Records:
                 self.all.append(Record(**json.loads(line)))
             except (json.JSONDecodeError, TypeError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
-                self._rewrite()
-
-    def _rewrite(self) -> None:
-        self.path.write_text("".join(_line(record) for record in self.all), encoding="utf-8")
+                write_text(self.path, "".join(_line(record) for record in self.all))
 
     def append(self, records: Iterable[Record]) -> None:
         """Add records to the list and to the file."""

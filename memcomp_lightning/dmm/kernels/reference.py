@@ -8,6 +8,7 @@ from torch import Tensor
 from memcomp_lightning.dmm.base import Recording, VectorField
 from memcomp_lightning.dmm.integrate import Integrator, Shake, still
 from memcomp_lightning.dmm.kernels.run import Run, Stall, Start, Visited
+from memcomp_lightning.qubo.alternating_descent import descend
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat
 from memcomp_lightning.qubo.qubo import Qubo
 
@@ -88,10 +89,7 @@ def quench(problem: Qubo | WeightedMaxSat, x: Tensor) -> Tensor:
     for _ in range(MAX_SWEEPS):
         before = x.clone()
         if isinstance(problem, Qubo):
-            for block in problem.graph.blocks():
-                field = problem.field(x)[..., block]
-                # A tie keeps its value, so that equal energies cannot alternate for ever.
-                x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))
+            descend(problem, x)
         else:
             gain = (1 - 2 * x) * problem.field(x)
             lowest, at = gain.min(-1, keepdim=True)
