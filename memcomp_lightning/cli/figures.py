@@ -53,7 +53,7 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     assert isinstance(figure, dict)
     curves = figure["curves"]
     data = build(composed_for([*overrides, "pretrain.iterations=1", "finetune.iterations=1"])).stages[0].data
-    compared = [name for name in figure["claim"] if name in curves]
+    claimed = [name for claim in figure["claims"] for name in (claim["than"], claim["better"]) if name in curves]
     n_parts = math.prod(data.replicas)
     parts = f"{n_parts} of {config.data.partitions} partitions of {data.n_train:,} images" if data.replicas else ""
     seeds = f"{len(figure['seeds'])} seeds" if len(figure["seeds"]) > 1 else ""
@@ -64,8 +64,8 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
         "data": data.images.name,
         "against": figure["against"],
         "passes": sorted(figure["passes"]),
-        "claim": figure["claim"],
-        "labels": {name: curves[name]["label"] for name in dict.fromkeys((*compared, *curves))},
+        "claims": figure["claims"],
+        "labels": {name: curves[name]["label"] for name in dict.fromkeys((*claimed, *curves))},
         "chosen": {name: curve["choose"]["setting"] for name, curve in curves.items() if "choose" in curve},
         "stop_early": [name for name, curve in curves.items() if curve.get("stop_early", False)],
         "scale": ", ".join(part for part in (whole, parts, seeds) if part),
@@ -78,7 +78,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         UserError, SettingError, InstantiationException: As ``build``.
     """
-    Plan(**_shown(config, overrides))
+    Plan.of(_shown(config, overrides))
     for name, curve in config.figure.curves.items():
         for key in curve:
             require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)

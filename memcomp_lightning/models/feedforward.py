@@ -55,15 +55,19 @@ class BatchNorm(nn.Module):
         n_features: Number of units, >= 1.
         replicas: Leading axes of independent layers.
         momentum: Weight of the newest batch in the running statistics, in (0, 1].
+        eps: Added to the variance, > 0.
     """
 
     running_mean: Tensor
     running_var: Tensor
 
-    def __init__(self, n_features: int, *, replicas: tuple[int, ...] = (), momentum: float = 0.1) -> None:
+    def __init__(
+        self, n_features: int, *, replicas: tuple[int, ...] = (), momentum: float = 0.1, eps: float = 1e-5
+    ) -> None:
         super().__init__()
         require_count("n_features", n_features)
         self.momentum = momentum
+        self.eps = eps
         self.weight = nn.Parameter(torch.ones(*replicas, n_features))
         self.bias = nn.Parameter(torch.zeros(*replicas, n_features))
         self.register_buffer("running_mean", torch.zeros(*replicas, n_features))
@@ -84,6 +88,7 @@ class BatchNorm(nn.Module):
             self.bias.flatten(),
             training=self.training and x.shape[-2] > 1,
             momentum=self.momentum,
+            eps=self.eps,
         )
         return normalised.view(channels.shape).movedim(0, -2)
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from memcomp_lightning.report.comparison import signed
-from memcomp_lightning.report.results import Results
+from memcomp_lightning.report.results import Claim, Results
 from memcomp_lightning.report.verdicts import horizontal_arrow, vertical_arrow
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
@@ -32,7 +32,7 @@ def plot_against_iterations(results: Results, *, width: float = 7.2, height: flo
     panels = figure.subplots(len(passes), 1, sharex=True, squeeze=False)[:, 0]
     lines = [curve for curve in results.curves if len(results.lengths(curve)) > 1]
     levels = [
-        curve for curve in results.curves if results.lengths(curve) == [0] and curve not in results.plan.claim
+        curve for curve in results.curves if results.lengths(curve) == [0] and curve not in results.plan.claimed
     ]
     for letter, axes, done in zip("abcdefgh", panels, passes, strict=False):
         for number, curve in enumerate(lines):
@@ -41,7 +41,9 @@ def plot_against_iterations(results: Results, *, width: float = 7.2, height: flo
             mean = results.point(curve, 0, done).mean
             colour = _COLOURS[(len(lines) + number) % len(_COLOURS)]
             axes.axhline(mean, color=colour, lw=1.1, linestyle=_LINES[number], label=results.label(curve))
-        _arrows(axes, results, done)
+        for number, claim in enumerate(results.plan.claims):
+            if set(claim.curves) <= set(results.curves):
+                _arrows(axes, results, claim, done, column=number)
         axes.set(ylabel="test accuracy", title=f"({letter}) {done} back-propagation passes")
         axes.title.set_size(10)
         axes.grid(alpha=0.25)
@@ -85,17 +87,17 @@ def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
         width: Inches.
     """
     passes = results.plan.passes if len(results.plan.passes) <= 4 else results.plan.passes[-1:]
-    curves = results.curves
+    curves, claimed = results.curves, results.plan.claimed
     figure = Figure(figsize=(width, 0.26 * len(curves) + 1.2), layout="constrained")
     panels = figure.subplots(1, len(passes), sharey=True, squeeze=False)[0]
     rows = np.arange(len(curves))[::-1]
     for axes, done in zip(panels, passes, strict=True):
         for row, curve in zip(rows, curves, strict=True):
             point = results.point(curve, results.lengths(curve)[-1], done)
-            colour = _COLOURS[results.plan.claim.index(curve)] if curve in results.plan.claim else "0.35"
+            colour = _COLOURS[claimed.index(curve)] if curve in claimed else "0.35"
             error = None if math.isnan(point.error) else 2 * point.error
             axes.errorbar(point.mean, row, xerr=error, fmt="o", ms=4, color=colour, capsize=2)
-            if curve in results.plan.claim:
+            if curve in claimed:
                 axes.axvline(point.mean, color=colour, lw=0.7, alpha=0.6)
         axes.set_title(f"{done} passes", size=9)
         axes.grid(alpha=0.25, axis="x")
@@ -135,18 +137,16 @@ def _errorbar(
     )
 
 
-def _arrows(axes: Axes, results: Results, passes: int) -> None:
+def _arrows(axes: Axes, results: Results, claim: Claim, passes: int, *, column: int) -> None:
     """The paper's two arrows: iterations saved, and accuracy gained at the last N."""
-    first, second = results.plan.claim
-    if first not in results.curves or second not in results.curves:
-        return
-    last = results.lengths(second)[-1]
-    low, high = (results.point(curve, results.lengths(curve)[-1], passes).mean for curve in (first, second))
+    last = results.lengths(claim.better)[-1]
+    low, high = (results.point(curve, results.lengths(curve)[-1], passes).mean for curve in claim.curves)
+    x = last + 1.2 + 6 * column
     style = {"arrowstyle": "<->", "color": "black", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", xy=(last + 1.2, high), xytext=(last + 1.2, low), arrowprops=style, annotation_clip=False)
-    gap = signed(vertical_arrow(results, passes).effect)
-    axes.annotate(gap, xy=(last + 1.8, (low + high) / 2), va="center", size=8, annotation_clip=False)
-    saved = horizontal_arrow(results, passes)
+    axes.annotate("", xy=(x, high), xytext=(x, low), arrowprops=style, annotation_clip=False)
+    gap = signed(vertical_arrow(results, claim, passes).effect)
+    axes.annotate(gap, xy=(x + 0.6, (low + high) / 2), va="center", size=8, annotation_clip=False)
+    saved = horizontal_arrow(results, claim, passes)
     if saved is not None and saved[0] < saved[1]:
         axes.annotate("", xy=(saved[0], low), xytext=(saved[1], low), arrowprops={**style, "arrowstyle": "->"})
         axes.annotate(
@@ -157,7 +157,7 @@ def _arrows(axes: Axes, results: Results, passes: int) -> None:
             ha="center",
             size=8,
         )
-    axes.set_xlim(right=last + 6)
+    axes.set_xlim(right=x + 4.8)
 
 
 def _title(results: Results) -> str:

@@ -1,18 +1,21 @@
 """The gradient of the mean cross-entropy of a batch, by the shortest way.
 
-Autograd spends more time on its graph than on the numbers of a 32-32-32-10 network: sigmoid networks get their
-gradient in closed form, the same to rounding, in half the time. All others get it by autograd.
+Autograd spends more time on its graph than on the numbers of a 32-32-32-10 network: networks of affine layers
+with sigmoid units, or with batch normalisation and ReLU, get their gradient in closed form, the same to rounding,
+in half the time or less. All others get it by autograd.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from memcomp_lightning.models import DBN, Linear
+from memcomp_lightning.models import DBN, RBM, BatchNorm, BatchNormReluNetwork, Linear
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.types import Batch
 
@@ -21,31 +24,121 @@ AddGradient = Callable[[Batch], None]
 
 
 def gradient_of(network: nn.Module) -> AddGradient:
-    """Return what adds the gradient of a network's parameters."""
-    if isinstance(network, nn.Sequential) and len(network) == 2:
-        hidden, output = network
-        if type(hidden) is DBN and type(output) is Linear:
-            layers = [(rbm.weight, rbm.c) for rbm in hidden] + [(output.weight, output.bias)]
-            return partial(_of_sigmoid_layers, layers)
-    return partial(_by_autograd, network)
+    """Return what adds the gradient of a network's parameters; the network is in training mode."""
+    layers = _layers_of(network)
+    return partial(_by_autograd, network) if layers is None else partial(_in_closed_form, layers)
+
+
+@dataclass
+class _Layer:
+    """An affine map, batch normalisation or not, and what follows: nothing, the sigmoid or the ReLU."""
+
+    weight: Parameter
+    bias: Parameter
+    units: str = "linear"
+    norm: BatchNorm | None = None
+
+
+def _layers_of(network: nn.Module) -> list[_Layer] | None:
+    """The layers from the inputs up; None for a network that is not made of them alone, or does not end linear."""
+    layers: list[_Layer] = []
+    for module in _flat(network):
+        if type(module) is RBM:
+            layers.append(_Layer(module.weight, module.c, "sigmoid"))
+        elif type(module) is Linear:
+            layers.append(_Layer(module.weight, module.bias))
+        elif not layers or layers[-1].units != "linear":
+            return None
+        elif type(module) is BatchNorm and layers[-1].norm is None:
+            layers[-1].norm = module
+        elif type(module) is nn.ReLU:
+            layers[-1].units = "relu"
+        else:
+            return None
+    hidden_are_bent = all(layer.units != "linear" for layer in layers[:-1])
+    ends_linear = bool(layers) and layers[-1].units == "linear" and layers[-1].norm is None
+    return layers if hidden_are_bent and ends_linear else None
+
+
+def _flat(network: nn.Module) -> Iterator[nn.Module]:
+    if type(network) is DBN or type(network) is nn.Sequential:
+        for module in network:
+            yield from _flat(module)
+    elif type(network) is BatchNormReluNetwork:
+        yield from _flat(network.layers)
+    else:
+        yield network
 
 
 @torch.no_grad()
-def _of_sigmoid_layers(layers: list[tuple[Parameter, Parameter]], batch: Batch) -> None:
-    r"""Back-propagation: ``\delta_{l-1} = (\delta_l W_l) \odot h (1 - h)``, with softmax less one-hot on top."""
-    activations = [batch.v]
-    for weight, bias in layers[:-1]:
-        activations.append(affine(activations[-1], weight, bias).sigmoid_())
-    delta = affine(activations[-1], *layers[-1]).softmax(-1)
-    delta.scatter_add_(-1, batch.label.unsqueeze(-1), delta.new_full((), -1.0).expand(*batch.label.shape, 1))
-    delta *= batch.share / batch.label.shape[-1]
+def _in_closed_form(layers: list[_Layer], batch: Batch) -> None:
+    r"""Back-propagation: ``\delta_{l-1} = \delta_l W_l \odot f'``, with softmax less one-hot on top."""
+    below, norms = [batch.v], []
+    for layer in layers[:-1]:
+        activation, norm = _forward(layer, below[-1])
+        below.append(activation)
+        norms.append(norm)
+    top = layers[-1]
+    # Classes before images: the softmax over a last axis of ten is twenty times slower.
+    delta = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1)).softmax(-2)
+    label = batch.label.unsqueeze(-2)
+    delta.scatter_add_(-2, label, delta.new_full((), -1.0).expand(label.shape))
+    delta = delta.mul_(batch.share / batch.label.shape[-1]).mT
     for number in range(len(layers) - 1, -1, -1):
-        weight, bias = layers[number]
-        below = activations[number]
-        _add(weight, delta.mT @ below)
-        _add(bias, delta.sum(-2))
+        layer = layers[number]
+        if number < len(layers) - 1:
+            delta = _backward(layer, delta, below[number + 1], norms[number])
+        _add(layer.weight, delta.mT @ below[number])
+        _add(layer.bias, delta.sum(-2))
         if number > 0:
-            delta = torch.ops.aten.sigmoid_backward(delta @ weight, below)
+            delta = delta @ layer.weight
+
+
+class _Normalised(NamedTuple):
+    """What batch normalisation needs on the way back; ``scale`` is weight / standard deviation."""
+
+    z: Tensor
+    scale: Tensor
+    inverse_std: Tensor
+    by_batch: bool
+
+
+def _forward(layer: _Layer, x: Tensor) -> tuple[Tensor, _Normalised | None]:
+    """Activations of a hidden layer, and what its normalisation needs on the way back."""
+    z, norm, saved = affine(x, layer.weight, layer.bias), layer.norm, None
+    if norm is not None:
+        n, by_batch = z.shape[-2], z.shape[-2] > 1
+        mean, variance = norm.running_mean, norm.running_var
+        if by_batch:
+            mean = z.mean(-2)
+        z -= mean.unsqueeze(-2)
+        if by_batch:
+            variance = z.square().mean(-2)
+            norm.running_mean.lerp_(mean, norm.momentum)
+            norm.running_var.lerp_(variance * (n / (n - 1)), norm.momentum)
+        inverse_std = (variance + norm.eps).rsqrt()
+        scale = (norm.weight * inverse_std).unsqueeze(-2)
+        saved = _Normalised(z, scale, inverse_std.unsqueeze(-2), by_batch)
+        z = torch.addcmul(norm.bias.unsqueeze(-2), z, scale)
+    return z.sigmoid_() if layer.units == "sigmoid" else z.relu_(), saved
+
+
+def _backward(layer: _Layer, delta: Tensor, activation: Tensor, saved: _Normalised | None) -> Tensor:
+    """From the gradient of a hidden layer's activations to that of its affine map."""
+    if layer.units == "sigmoid":
+        delta = torch.ops.aten.sigmoid_backward(delta, activation)
+    else:
+        delta = torch.ops.aten.threshold_backward(delta, activation, 0)
+    if saved is None or layer.norm is None:
+        return delta
+    normalised = saved.z * saved.inverse_std
+    shift, scale = delta.sum(-2), (delta * normalised).sum(-2)
+    _add(layer.norm.bias, shift)
+    _add(layer.norm.weight, scale)
+    if saved.by_batch:
+        n = delta.shape[-2]
+        delta = delta.sub_((shift / n).unsqueeze(-2)).addcmul_(normalised, (scale / n).unsqueeze(-2), value=-1)
+    return delta.mul_(saved.scale)
 
 
 def _add(parameter: Parameter, gradient: Tensor) -> None:

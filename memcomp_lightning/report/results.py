@@ -17,12 +17,36 @@ from memcomp_lightning.errors import require_choice
 from memcomp_lightning.report.records import Records
 
 
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """The paper says that one curve is better than another.
+
+    Attributes:
+        better: Name of a curve.
+        than: Name of the other.
+        controls: Curves that may explain the difference; None for all that are in no claim and control no other.
+    """
+
+    better: str
+    than: str
+    controls: Sequence[str] | None = None
+
+    @property
+    def curves(self) -> tuple[str, str]:
+        """Both, as the legend has them."""
+        return self.than, self.better
+
+
 class Point(NamedTuple):
     """Mean accuracy over partitions and seeds, and its standard error sigma / sqrt(n) (NaN for a single one)."""
 
     mean: float
     error: float
     n: int
+
+    def __str__(self) -> str:
+        """For tables."""
+        return f"{self.mean:.3f}" + (f" ± {self.error:.3f}" if self.n > 1 else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +59,7 @@ class Plan:
         data: Name of the data set.
         against: Axis of the curves, "iterations" or "passes".
         passes: Fine-tuning passes after which the networks were tested.
-        claim: Names of two curves; the paper says that the second one is better.
+        claims: Pairs of curves that the paper compares.
         labels: Names for people, by curve, in the order of the legend.
         chosen: The setting that is chosen on held-out images, by curve.
         stop_early: Curves that report the pass of best validation accuracy.
@@ -47,7 +71,7 @@ class Plan:
     data: str
     against: str
     passes: Sequence[int]
-    claim: Sequence[str]
+    claims: Sequence[Claim]
     labels: Mapping[str, str]
     chosen: Mapping[str, str]
     stop_early: Sequence[str]
@@ -55,8 +79,25 @@ class Plan:
 
     def __post_init__(self) -> None:
         require_choice("figure.against", self.against, ("iterations", "passes"))
-        for curve in self.claim:
-            require_choice("figure.claim", curve, tuple(self.labels))
+        for curve in self.claimed:
+            require_choice("figure.claims", curve, tuple(self.labels))
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> "Plan":
+        """From the plain values of ``figure.json``."""
+        return cls(**{**settings, "claims": [Claim(**claim) for claim in settings["claims"]]})
+
+    @property
+    def claimed(self) -> list[str]:
+        """Curves of all claims, in the order of the legend."""
+        return [curve for claim in self.claims for curve in claim.curves]
+
+    def controls(self, claim: Claim) -> list[str]:
+        """Curves that may explain a claim."""
+        if claim.controls is not None:
+            return list(claim.controls)
+        taken = {curve for other in self.claims for curve in (*other.curves, *(other.controls or ()))}
+        return [curve for curve in self.labels if curve not in taken]
 
 
 class Results:
@@ -129,4 +170,4 @@ def read_results(folder: Path) -> Results:
         raise FileNotFoundError(
             f"{folder} holds no figure.json: name the folder of a run like memcomp-train experiment=figure4."
         )
-    return Results(Plan(**json.loads(path.read_text(encoding="utf-8"))), Records(folder))
+    return Results(Plan.of(json.loads(path.read_text(encoding="utf-8"))), Records(folder))

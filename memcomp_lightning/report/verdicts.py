@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.report.comparison import Comparison, compare
-from memcomp_lightning.report.results import Results
+from memcomp_lightning.report.results import Claim, Results
 
 HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
 
@@ -36,46 +36,48 @@ class Verdict(NamedTuple):
 
 
 def verdicts(results: Results) -> list[Verdict]:
-    """Judge the claims of a figure."""
-    if any(curve not in results.curves for curve in results.plan.claim):
-        return []
-    return _passes_claims(results) if results.plan.against == "passes" else _iterations_claims(results)
+    """Judge the claims of a figure, those of which both curves were measured."""
+    judge = _against_passes if results.plan.against == "passes" else _against_iterations
+    return [
+        verdict
+        for claim in results.plan.claims
+        if set(claim.curves) <= set(results.curves)
+        for verdict in judge(results, claim)
+    ]
 
 
-def horizontal_arrow(results: Results, passes: int) -> tuple[int, int] | None:
-    """Pretraining iterations of the second curve for what the first one reaches at its last N, and that N.
+def horizontal_arrow(results: Results, claim: Claim, passes: int) -> tuple[int, int] | None:
+    """Pretraining iterations of the better curve for what the other one reaches at its last N, and that N.
 
     None if it never gets there.
     """
-    first, second = results.plan.claim
-    last = results.lengths(first)[-1]
-    goal = results.point(first, last, passes).mean
-    return next(
-        ((n, last) for n in results.lengths(second) if results.point(second, n, passes).mean >= goal), None
-    )
+    last = results.lengths(claim.than)[-1]
+    goal = results.point(claim.than, last, passes).mean
+    lengths = results.lengths(claim.better)
+    return next(((n, last) for n in lengths if results.point(claim.better, n, passes).mean >= goal), None)
 
 
-def vertical_arrow(results: Results, passes: int) -> Comparison:
-    """Accuracy of the second curve less that of the first one, each at its last N."""
-    first, second = results.plan.claim
-    return compare(_at_last(results, second, passes), _at_last(results, first, passes))
+def vertical_arrow(results: Results, claim: Claim, passes: int) -> Comparison:
+    """Accuracy of the better curve less that of the other one, each at its last N."""
+    return compare(_at_last(results, claim.better, passes), _at_last(results, claim.than, passes))
 
 
 def _at_last(results: Results, curve: str, passes: int) -> NDArray[np.float64]:
     return results.values(curve, results.lengths(curve)[-1], passes)
 
 
-def _iterations_claims(results: Results) -> list[Verdict]:
-    first, second = results.plan.claim
+def _against_iterations(results: Results, claim: Claim) -> list[Verdict]:
+    first, second = claim.curves
     names = results.plan.labels
     found = []
     for passes in results.plan.passes:
         last = results.lengths(second)[-1]
         after = f"after {passes} passes"
-        arrow, goal = horizontal_arrow(results, passes), results.point(first, results.lengths(first)[-1], passes)
+        arrow = horizontal_arrow(results, claim, passes)
+        goal = results.point(first, results.lengths(first)[-1], passes)
         free = [
             curve
-            for curve in results.curves
+            for curve in results.plan.controls(claim)
             if results.lengths(curve) == [0] and results.point(curve, 0, passes).mean >= goal.mean
         ]
         saved = arrow is not None and arrow[0] < arrow[1]
@@ -87,28 +89,27 @@ def _iterations_claims(results: Results) -> list[Verdict]:
                 *_verdict(results, saved, free),
             )
         )
-        gain = vertical_arrow(results, passes)
-        a, b = results.point(second, last, passes), goal
+        gain = vertical_arrow(results, claim, passes)
         found.append(
             Verdict(
-                f"a gap remains at N = {last} ({after})",
-                f"{a.mean:.3f} ± {a.error:.3f} against {b.mean:.3f} ± {b.error:.3f}",
+                f"{names[second]} is above {names[first]} at N = {last} ({after})",
+                f"{results.point(second, last, passes)} against {goal}",
                 str(gain),
-                *_verdict(results, gain.is_gain, explaining(results, passes, gain)),
+                *_verdict(results, gain.is_gain, explaining(results, claim, passes, gain)),
             )
         )
     return found
 
 
-def _passes_claims(results: Results) -> list[Verdict]:
-    first, second = results.plan.claim
+def _against_passes(results: Results, claim: Claim) -> list[Verdict]:
+    first, second = claim.curves
     names = results.plan.labels
     passes = results.plan.passes[-1]
-    gain = vertical_arrow(results, passes)
+    gain = vertical_arrow(results, claim, passes)
     a, b = (results.point(curve, results.lengths(curve)[-1], passes) for curve in (second, first))
     fewer = (a.mean - b.mean) / (1 - b.mean)
     measured = f"{a.mean:.4f} ± {a.error:.4f} against {b.mean:.4f} ± {b.error:.4f}"
-    by_control = explaining(results, passes, gain)
+    by_control = explaining(results, claim, passes, gain)
     best = max(results.plan.passes, key=lambda p: results.point(first, results.lengths(first)[-1], p).mean)
     at_best = compare(_at_last(results, second, passes), _at_last(results, first, best))
     return [
@@ -133,18 +134,11 @@ def _passes_claims(results: Results) -> list[Verdict]:
     ]
 
 
-def explaining(results: Results, passes: int, gain: Comparison) -> list[str]:
-    """Controls that account for more than half of a gain; other names for the compared methods are none."""
-    first, second = results.plan.claim
-    best = _at_last(results, second, passes)
-    found = []
-    for curve in results.curves:
-        if curve in (first, second) or curve.startswith(f"{second}_"):
-            continue
-        left = compare(best, _at_last(results, curve, passes))
-        if left.high < gain.effect / 2:
-            found.append(curve)
-    return found
+def explaining(results: Results, claim: Claim, passes: int, gain: Comparison) -> list[str]:
+    """Controls that account for more than half of a gain."""
+    best = _at_last(results, claim.better, passes)
+    measured = [curve for curve in results.plan.controls(claim) if curve in results.curves]
+    return [c for c in measured if compare(best, _at_last(results, c, passes)).high < gain.effect / 2]
 
 
 def _verdict(results: Results, holds: bool, controls: list[str]) -> tuple[str, tuple[str, ...]]:

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian
+from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear
 from memcomp_lightning.modules import DBNClassifier, score
 from memcomp_lightning.replicas import stacked
 from memcomp_lightning.replicas.backprop import gradient_of
@@ -46,10 +47,24 @@ def test_gradient_is_that_of_the_mean_cross_entropy(kind, replicas):
             torch.testing.assert_close(p.grad, q.grad, rtol=1e-12, atol=1e-13, msg=name)
 
 
-def test_closed_form_is_taken_for_sigmoid_networks_alone():
-    assert "sigmoid" in gradient_of(classifier((2,))).func.__name__
-    assert "autograd" in gradient_of(classifier((2,), "batch_norm_relu")).func.__name__
-    assert "autograd" in gradient_of(BatchNormReluNetwork(7, [5], 11)).func.__name__
+def test_closed_form_is_taken_where_it_exists():
+    closed = [classifier((2,)), classifier((2,), "batch_norm_relu"), BatchNormReluNetwork(7, [5], 11)]
+    others = [nn.Identity(), nn.Sequential(Linear(7, 5), Linear(5, 11)), DBN(7, [11]), nn.Sequential()]
+    assert all(gradient_of(network).func.__name__ == "_in_closed_form" for network in closed)
+    assert all(gradient_of(network).func.__name__ == "_by_autograd" for network in others)
+
+
+@pytest.mark.parametrize("n", [1, 13])
+def test_running_statistics_of_batch_normalisation_move_as_in_the_module(n):
+    quick, slow = (classifier((2, 3), "batch_norm_relu") for _ in range(2))
+    data = batch((2, 3), n)
+    gradient_of(quick)(data)
+    score(slow(data.v), data.label).mean_loss.sum().backward()
+    for name, buffer in slow.named_buffers():
+        torch.testing.assert_close(quick.get_buffer(name), buffer, rtol=1e-12, atol=1e-13, msg=name)
+    torch.testing.assert_close(
+        next(quick.parameters()).grad, 0.7 * next(slow.parameters()).grad, rtol=1e-12, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("units", ["sigmoid", "batch_norm_relu"])

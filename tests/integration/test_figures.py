@@ -79,7 +79,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
 def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train: Run, control: str) -> None:
     iterations = 0 if control in ("no_pretraining", "gaussian", "xavier_1", "xavier_4", "bn_relu") else 2
     curve = f"+figure.curves.x={{label: x, overrides: ['control={control}'], iterations: [{iterations}]}}"
-    drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", "figure.claim=[x,x]"]
+    drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", "figure.claims=[{better:x,than:x}]"]
     quick = ["solver.n_restarts=3"] + ([] if control in ("descent", "annealing") else ["solver.max_steps=20"])
     small = [o for o in SMALL if not o.startswith("solver")] + quick
     outcome = memcomp_train("experiment=figure4", *small, NO_CONTROLS, curve, *drop, "hydra.run.dir=run")
@@ -112,7 +112,7 @@ FIGURE = [
 def test_a_figure_is_trained_reported_and_resumed(memcomp_train: Run) -> None:
     outcome = memcomp_train(*FIGURE)
     assert outcome.status == 0, outcome.err
-    assert "a gap remains at N = 3 (after 2 passes)" in outcome.out
+    assert "Mem-QUBO is above CD-1 at N = 3 (after 2 passes)" in outcome.out
     for name in (
         "figure4.png",
         "figure4.svg",
@@ -164,7 +164,7 @@ def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> 
     ("override", "message"),
     [
         ("+figure.curves.cd1.colour=red", "setting of figure.curves.cd1 = 'colour' is not allowed"),
-        ("figure.claim=[cd1,memqubo]", "figure.claim = 'memqubo'"),
+        ("figure.claims=[{better:memqubo,than:cd1}]", "figure.claims = 'memqubo'"),
         ("figure.against=epochs", "figure.against = 'epochs'"),
         ("+figure.curves.x={label: x, overrides: ['sampler=cdd']}", "cdd"),
     ],
@@ -235,7 +235,7 @@ def test_a_value_that_diverges_is_not_chosen_and_a_curve_that_does_is_named(memc
         "choose: {setting: pretrain.optimizer.lr, values: %s}}"
     )
     small = ["experiment=figure4", *SMALL, NO_CONTROLS, "~figure.curves.cd1", "~figure.curves.mem_qubo"]
-    small.append("figure.claim=[x,x]")
+    small.append("figure.claims=[{better:x,than:x}]")
     outcome = memcomp_train(*small, curve % "[1e30,0.1]", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     assert records().best_choice("x") == 0.1

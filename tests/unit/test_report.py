@@ -1,6 +1,7 @@
 """Records, paired comparisons, and verdicts on made-up measurements whose answer is known."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ from scipy import stats
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.report import Plan, Record, Records, Results, markdown, page, verdicts
+from memcomp_lightning.report import Claim, Plan, Record, Records, Results, markdown, page, verdicts
 from memcomp_lightning.report.comparison import compare
 from memcomp_lightning.report.page import Section
 from memcomp_lightning.report.verdicts import HOLDS, horizontal_arrow, vertical_arrow
+
+CLAIM = Claim(better="mem", than="cd")
 
 
 def noise(*shape, seed=0):
@@ -42,7 +45,7 @@ def plan(**settings):
         "data": "digits",
         "against": "iterations",
         "passes": [10, 20],
-        "claim": ["cd", "mem"],
+        "claims": [CLAIM],
         "labels": {"cd": "CD-1", "mem": "Mem-QUBO", "shuffled": "shuffled", "free": "no pretraining"},
         "chosen": {},
         "stop_early": [],
@@ -109,9 +112,9 @@ def test_arrows_are_measured(tmp_path):
         ],
         *[record("mem", [[a + s for s in spread]] * 2, n) for n, a in ((1, 0.2), (5, 0.35), (9, 0.8))],
     )
-    assert horizontal_arrow(found, 10) == (5, 9)
-    assert vertical_arrow(found, 10).effect == pytest.approx(0.5)
-    assert horizontal_arrow(found, 20) == (9, 9)
+    assert horizontal_arrow(found, CLAIM, 10) == (5, 9)
+    assert vertical_arrow(found, CLAIM, 10).effect == pytest.approx(0.5)
+    assert horizontal_arrow(found, CLAIM, 20) == (9, 9)
 
 
 def test_gap_holds_only_without_the_control_that_reaches_it(tmp_path):
@@ -173,8 +176,8 @@ def test_page_and_markdown_escape_what_they_are_given(tmp_path):
 
 
 def test_plan_refuses_unknown_curves_and_axes():
-    with pytest.raises(SettingError, match=r"figure\.claim = 'x'"):
-        plan(claim=["cd", "x"])
+    with pytest.raises(SettingError, match=r"figure\.claims = 'x'"):
+        plan(claims=[Claim(better="x", than="cd")])
     with pytest.raises(SettingError, match=r"figure\.against = 'epochs'"):
         plan(against="epochs")
-    assert json.dumps(plan().__dict__)
+    assert Plan.of(json.loads(json.dumps(asdict(plan())))) == plan()
