@@ -59,7 +59,7 @@ _SETTINGS = {
     "": (*_GROUPS, "seed", "between_stages", "figure"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": _STAGE_SETTINGS,
-    "finetune": (*_STAGE_SETTINGS, "units"),
+    "finetune": (*_STAGE_SETTINGS, "loss", "units"),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
@@ -101,6 +101,7 @@ def build(config: DictConfig) -> Plan:
         settings: dict[str, Any] = {
             "iterations": config.finetune.iterations,
             "optimizer": _optimizer(config, "finetune", callbacks),
+            "loss": config.finetune.loss,
             "seed": seed,
         }
         classifier: Classifier

@@ -1,16 +1,21 @@
 """A figure of the paper: its curves as networks to train, a record for each as soon as it exists."""
 
+import copy
+import functools
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra import compose
+from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, tuning
 from memcomp_lightning.cli.workers import runner
 from memcomp_lightning.errors import require_choice, require_count
@@ -24,9 +29,11 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
     """Train what is missing for a figure; each record is written when it exists."""
     records = Records(folder)
     write_text(folder / "figure.json", json.dumps(_shown(config, overrides), indent=1) + "\n")
+    # Composed before anything trains: a configuration file that is edited meanwhile changes nothing.
+    composed = {str(n): composed_for((*overrides, *curve.overrides)) for n, curve in config.figure.curves.items()}
     with runner(config) as run:
         for choosing in (True, False):
-            units = plan_units(config, overrides, records, choosing=choosing)
+            units = plan_units(config, composed, records, choosing=choosing)
             with tqdm(total=sum(unit.n_updates for unit in units), unit="update", unit_scale=True) as bar:
                 bar.set_description(config.figure.name)
 
@@ -52,7 +59,7 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     figure = OmegaConf.to_container(config.figure, resolve=True)
     assert isinstance(figure, dict)
     curves = figure["curves"]
-    data = build(composed_for([*overrides, "pretrain.iterations=1", "finetune.iterations=1"])).stages[0].data
+    data = build(composed_for((*overrides, "pretrain.iterations=1", "finetune.iterations=1"))).stages[0].data
     claimed = [name for claim in figure["claims"] for name in (claim["than"], claim["better"]) if name in curves]
     n_parts = math.prod(data.replicas)
     parts = f"{n_parts} of {config.data.partitions} partitions of {data.n_train:,} images" if data.replicas else ""
@@ -82,20 +89,25 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for name, curve in config.figure.curves.items():
         for key in curve:
             require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)
-        extra = [f"{curve.choose.setting}={curve.choose['values'][0]}"] if "choose" in curve else []
-        build(composed_for([*overrides, *curve.overrides, *extra]))
+        composed = composed_for((*overrides, *curve.overrides))
+        if "choose" in curve:
+            try:
+                composed = _with_choice(composed, curve.choose.setting, curve.choose["values"][0])
+            except OmegaConfBaseException as error:
+                raise UserError(
+                    f"figure.curves.{name}.choose.setting = {curve.choose.setting!r}: {error}"
+                ) from error
+        build(composed)
 
 
-def plan_units(config: DictConfig, overrides: Sequence[str], records: Records, *, choosing: bool) -> list[Unit]:
-    """What is to be trained and has no record yet, the choices or the curves themselves.
-
-    Raises:
-        UserError, SettingError: A curve's settings are wrong.
-    """
+def plan_units(
+    config: DictConfig, composed: Mapping[str, DictConfig], records: Records, *, choosing: bool
+) -> list[Unit]:
+    """What is to be trained and has no record yet, the choices or the curves themselves."""
     passes = tuple(sorted(config.figure.passes))
     groups: dict[str, list[Member]] = {}
-    for name, curve in config.figure.curves.items():
-        for member in _members(config, overrides, str(name), curve, records, choosing=choosing):
+    for name, settings in composed.items():
+        for member in _members(config, name, settings, records, choosing=choosing):
             groups.setdefault(member.fine_tuning, []).append(member)
     units = []
     for members in groups.values():
@@ -109,9 +121,10 @@ def plan_units(config: DictConfig, overrides: Sequence[str], records: Records, *
 
 
 def _members(
-    config: DictConfig, overrides: Sequence[str], name: str, curve: DictConfig, records: Records, *, choosing: bool
+    config: DictConfig, name: str, composed: DictConfig, records: Records, *, choosing: bool
 ) -> Iterator[Member]:
     """The networks of a curve, or those for its choice, that have no record."""
+    curve = config.figure.curves[name]
     iterations, seeds = list(curve.get("iterations", config.figure.iterations)), list(config.figure.seeds)
     values: list[float | None] = [None]
     if "choose" in curve:
@@ -119,26 +132,38 @@ def _members(
     elif choosing:
         return
     for value in values:
-        extra = [] if value is None else [f"{curve.choose.setting}={value}"]
         if choosing:
-            extra, iterations, seeds = [*extra, "data.validation_fraction=0.1"], iterations[-1:], seeds[:1]
+            iterations, seeds = iterations[-1:], seeds[:1]
         missing = [(n, s) for n in iterations for s in seeds if not records.has(name, value, choosing, n, s)]
         if missing:
-            composed = composed_for([*overrides, *curve.overrides, *extra])
-            plain: Any = OmegaConf.to_container(composed, resolve=False)
+            settings = composed if value is None else _with_choice(composed, curve.choose.setting, value)
+            if choosing:
+                settings.data.validation_fraction = 0.1
+            plain: Any = OmegaConf.to_container(settings, resolve=False)
             yield from (Member(name, plain, n, seed, value, choosing) for n, seed in missing)
 
 
-def composed_for(overrides: Sequence[str]) -> DictConfig:
-    """The configuration of one curve, without the figure.
+@functools.cache
+def composed_for(overrides: tuple[str, ...]) -> DictConfig:
+    """The configuration of one curve, without the figure; not to be changed.
 
     Settings that the curve does not have are left out: ``solver.max_steps`` where its solver is descent.
     """
     own = [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "figure.", "figure/"))]
-    bare = compose("config", [o for o in own if "." not in o.partition("=")[0]])
-    composed = compose("config", [o for o in own if _applies(o.partition("=")[0], bare)])
+    try:
+        composed = compose("config", own)
+    except ConfigCompositionException:
+        bare = compose("config", [o for o in own if "." not in o.partition("=")[0]])
+        composed = compose("config", [o for o in own if _applies(o.partition("=")[0], bare)])
     composed.figure = None
     return composed
+
+
+def _with_choice(composed: DictConfig, setting: str, value: float) -> DictConfig:
+    """A copy in which a setting has the value, one that begins with ``+`` is added."""
+    settings = copy.deepcopy(composed)
+    OmegaConf.update(settings, setting.lstrip("+"), value, force_add=setting.startswith("+"))
+    return settings
 
 
 def _applies(name: str, config: DictConfig) -> bool:

@@ -52,7 +52,9 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
             _between(plan, config)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
     if plan.finetuning is not None:
-        score = evaluate(_trained(plan.finetuning), plan.finetuning.data.test_dataloader())
+        module = plan.finetuning.module
+        assert isinstance(module, Classifier)
+        score = evaluate(module.network, plan.finetuning.data.test_dataloader(), module.loss)
         result["test_accuracy"] = _numbers(score.accuracy)
         result["test_loss"] = _numbers(score.mean_loss)
     if is_global_zero and not config.trainer.fast_dev_run:

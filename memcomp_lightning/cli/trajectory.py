@@ -28,7 +28,7 @@ def prepare(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolv
     Raises:
         SettingError: The solver is not the DMM, or nothing is pretrained.
     """
-    composed = composed_for(overrides)
+    composed = composed_for(tuple(overrides))
     plan, solver = build(composed), instantiate(composed.solver)
     if not isinstance(plan.network, DBN) or plan.pretraining is None:
         raise SettingError(f"{config.figure.name} needs pretraining: model=dbn and pretrain.iterations >= 1.")

@@ -129,18 +129,19 @@ def _fine_tuned(
     """Scores by name, pass, member and replica."""
     stage = tuning(plans[0])
     n_members, replicas = len(plans), stage.data.replicas
-    network = stacked([_classifier(plan).network for plan in plans], replicas).to(device)
+    network, loss = stacked([_classifier(plan).network for plan in plans], replicas), _classifier(plans[0]).loss
+    network.to(device)
     batches = stage.data.train_batches(0, 1).repeated([member.seed for member in members]).to(device)
     tests = {"test": stage.data.test, "validation": stage.data.validation}
     images = {name: _side_by_side(*held, n_members, replicas, device) for name, held in tests.items() if held}
     scores: dict[str, list[Tensor]] = {f"{name}_{what}": [] for name in images for what in ("accuracy", "loss")}
     n_updates = len(batches) * n_members * math.prod(replicas)
     try:
-        for done in finetune(network, batches, iterations=unit.passes[-1], rates=rates_of(stage)):
+        for done in finetune(network, batches, iterations=unit.passes[-1], rates=rates_of(stage), loss=loss):
             progress(f"{unit.title}, pass {done} of {unit.passes[-1]}", n_updates)
             if done in unit.passes:
                 for name, batch in images.items():
-                    score = evaluate(network, [batch])
+                    score = evaluate(network, [batch], loss)
                     scores[f"{name}_accuracy"].append(score.accuracy)
                     scores[f"{name}_loss"].append(score.mean_loss)
     except DivergedError:

@@ -10,6 +10,7 @@ from memcomp_lightning.data.images import ImageData, ImageSource, PixelLayout
 from memcomp_lightning.data.loading import Batches
 from memcomp_lightning.data.mnist import Mnist, ReducedMnist
 from memcomp_lightning.data.module import ImageDataModule
+from memcomp_lightning.data.pixels import GreySource
 from memcomp_lightning.data.reduce import SIX_BY_SIX_WITHOUT_CORNERS, reduce_images
 from memcomp_lightning.data.synthetic import BarsAndStripes, ShiftingBars
 
@@ -19,6 +20,7 @@ __all__ = [
     "Batches",
     "CorruptFileError",
     "Digits",
+    "GreySource",
     "ImageData",
     "ImageDataModule",
     "ImageSource",

@@ -21,6 +21,7 @@ class BaselineClassifier(Classifier):
         replicas: Leading axes of independent networks.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser.
+        loss: As for :class:`Classifier`.
         weight_init: Draws all weights.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
         seed: Seed of the random streams.
@@ -35,6 +36,7 @@ class BaselineClassifier(Classifier):
         replicas: tuple[int, ...] = (),
         iterations: int = 100,
         optimizer: OptimizerFactory = PAPER_SGD,
+        loss: str = "cross_entropy",
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
         seed: int = 0,
@@ -47,4 +49,4 @@ class BaselineClassifier(Classifier):
             weight_init=weight_init,
             generator=generator,
         )
-        super().__init__(network, iterations=iterations, optimizer=optimizer, seed=seed)
+        super().__init__(network, iterations=iterations, optimizer=optimizer, loss=loss, seed=seed)

@@ -3,11 +3,11 @@
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.modules.losses import LOSSES, Loss, cross_entropy
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
 from memcomp_lightning.types import Batch
 
@@ -16,7 +16,7 @@ class Score(NamedTuple):
     """Sums over images, so that chunks add up.
 
     Attributes:
-        loss: Sum of cross-entropies in nats, ``(*replicas,)``.
+        loss: Sum of the losses, ``(*replicas,)``.
         n_correct: Images whose largest logit is their label's, ``(*replicas,)``.
         n_images: Images a replica.
     """
@@ -38,40 +38,39 @@ class Score(NamedTuple):
 
     @property
     def mean_loss(self) -> Tensor:
-        """Mean cross-entropy in nats, ``(*replicas,)``."""
+        """Mean loss, ``(*replicas,)``."""
         return self.loss / self.n_images
 
 
-def score(logits: Tensor, label: Tensor) -> Score:
+def score(logits: Tensor, label: Tensor, loss: Loss = cross_entropy) -> Score:
     """Return the score of logits ``(*replicas, n, n_classes)`` against labels ``(*replicas, n)``."""
-    # torch's cross-entropy wants the classes on the second axis.
-    losses = F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none").view(label.shape)
     n_correct = (logits.argmax(-1) == label).sum(-1)
-    return Score(losses.sum(-1), n_correct, label.shape[-1])
+    return Score(loss(logits, label).sum(-1), n_correct, label.shape[-1])
 
 
 @torch.no_grad()
-def evaluate(network: nn.Module, batches: Any) -> Score:
+def evaluate(network: nn.Module, batches: Any, loss: Loss = cross_entropy) -> Score:
     """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
     was_training = network.training
     network.eval()
     like = next(network.parameters())
-    scores = [score(network(batch.v.to(like)), batch.label.to(like.device)) for batch in batches]
+    scores = [score(network(batch.v.to(like)), batch.label.to(like.device), loss) for batch in batches]
     network.train(was_training)
     return sum(scores[1:], start=scores[0])
 
 
 class Classifier(StageModule):
-    """Minimise the cross-entropy of a network by back-propagation.
+    """Minimise the loss of a network by back-propagation.
 
     Args:
         network: Maps inputs ``(*replicas, n, n_visible)`` to logits ``(*replicas, n, n_classes)``.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser from the network's parameters.
+        loss: "cross_entropy", or "squared_error" of sigmoid outputs.
         seed: Seed of the random streams.
 
     Raises:
-        SettingError: ``iterations`` out of range.
+        SettingError: ``iterations`` or ``loss`` out of range.
     """
 
     stage = "finetune"
@@ -82,11 +81,14 @@ class Classifier(StageModule):
         *,
         iterations: int = 100,
         optimizer: OptimizerFactory = PAPER_SGD,
+        loss: str = "cross_entropy",
         seed: int = 0,
     ) -> None:
         require_count("finetune.iterations", iterations)
+        require_choice("finetune.loss", loss, tuple(LOSSES))
         super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
         self.network = network
+        self.loss = LOSSES[loss]
 
     def forward(self, v: Tensor) -> Tensor:
         """Class logits."""
@@ -98,19 +100,19 @@ class Classifier(StageModule):
         return self.make_optimizer(self.network.parameters())
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """Follow the gradient of the mean cross-entropy; replicas add up and stay independent.
+        """Follow the gradient of the mean loss; replicas add up and stay independent.
 
         Returns:
             ``loss`` (scalar) and ``score``.
         """
-        sums = score(self(batch.v), batch.label)
+        sums = score(self(batch.v), batch.label, self.loss)
         loss = batch.share * sums.mean_loss.sum()
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": Score(sums.loss.detach(), sums.n_correct, sums.n_images)}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Return the ``score`` of held-out images."""
-        return {"score": score(self(batch.v), batch.label)}
+        return {"score": score(self(batch.v), batch.label, self.loss)}
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Return the ``score`` of test images."""

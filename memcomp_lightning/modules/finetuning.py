@@ -20,6 +20,7 @@ class DBNClassifier(Classifier):
         n_classes: Size of the output layer, >= 2.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser.
+        loss: As for :class:`Classifier`.
         units: Hidden units: "sigmoid", or "batch_norm_relu" for batch normalisation and ReLU on the same weights.
         output_init: Draws the weights of the output layer; None is N(0, 0.01^2).
         generator: Random stream of these weights; None is a fresh stream of seed 0.
@@ -33,6 +34,7 @@ class DBNClassifier(Classifier):
         n_classes: int = 10,
         iterations: int = 100,
         optimizer: OptimizerFactory = PAPER_SGD,
+        loss: str = "cross_entropy",
         units: Literal["sigmoid", "batch_norm_relu"] = "sigmoid",
         output_init: Initialiser | None = None,
         generator: Generator | None = None,
@@ -45,7 +47,7 @@ class DBNClassifier(Classifier):
         )
         hidden = dbn if units == "sigmoid" else with_batch_norm_relu(dbn).to(dbn[0].weight)
         network = nn.Sequential(hidden, output.to(dbn[0].weight))
-        super().__init__(network, iterations=iterations, optimizer=optimizer, seed=seed)
+        super().__init__(network, iterations=iterations, optimizer=optimizer, loss=loss, seed=seed)
         self.dbn = dbn
 
     def parameters_at_rest(self) -> Iterable[Parameter]:

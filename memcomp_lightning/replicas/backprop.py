@@ -1,4 +1,4 @@
-"""The gradient of the mean cross-entropy of a batch, by the shortest way.
+"""The gradient of the mean loss of a batch, by the shortest way.
 
 Autograd spends more time on its graph than on the numbers of a 32-32-32-10 network: networks of affine layers
 with sigmoid units, or with batch normalisation and ReLU, get their gradient in closed form, the same to rounding,
@@ -11,22 +11,51 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn import Parameter
 
 from memcomp_lightning.models import DBN, RBM, BatchNorm, BatchNormReluNetwork, Linear
 from memcomp_lightning.models.affine import affine
+from memcomp_lightning.modules import Loss, cross_entropy, squared_error
 from memcomp_lightning.types import Batch
 
 AddGradient = Callable[[Batch], None]
-"""Adds the gradient of ``share * mean cross-entropy``, summed over the replicas, to the parameters' ``grad``."""
+"""Adds the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
 
 
-def gradient_of(network: nn.Module) -> AddGradient:
+def gradient_of(network: nn.Module, loss: Loss = cross_entropy) -> AddGradient:
     """Return what adds the gradient of a network's parameters; the network is in training mode."""
-    layers = _layers_of(network)
-    return partial(_by_autograd, network) if layers is None else partial(_in_closed_form, layers)
+    layers, of_logits = _layers_of(network), _OF_LOGITS.get(loss)
+    if layers is None or of_logits is None:
+        return partial(_by_autograd, network, loss)
+    return partial(_in_closed_form, layers, of_logits)
+
+
+def _of_cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
+    """Softmax less one-hot."""
+    return _less_one_hot(logits.softmax(-2), label)
+
+
+def _of_squared_error(logits: Tensor, label: Tensor) -> Tensor:
+    """(s - y) s (1 - s) with the sigmoid s and one-hot y."""
+    s = logits.sigmoid_()
+    gradient: Tensor = torch.ops.aten.sigmoid_backward(_less_one_hot(s.clone(), label), s)
+    return gradient
+
+
+def _less_one_hot(x: Tensor, label: Tensor) -> Tensor:
+    label = label.unsqueeze(-2)
+    return x.scatter_add_(-2, label, x.new_full((), -1.0).expand(label.shape))
+
+
+_OF_LOGITS: dict[Loss, Callable[[Tensor, Tensor], Tensor]] = {
+    cross_entropy: _of_cross_entropy,
+    squared_error: _of_squared_error,
+}
+"""Gradient of a loss by its logits; logits are ``(*replicas, n_classes, n)``, labels ``(*replicas, n)``.
+
+Classes before images: the softmax over a last axis of ten is twenty times slower.
+"""
 
 
 @dataclass
@@ -71,19 +100,16 @@ def _flat(network: nn.Module) -> Iterator[nn.Module]:
 
 
 @torch.no_grad()
-def _in_closed_form(layers: list[_Layer], batch: Batch) -> None:
-    r"""Back-propagation: ``\delta_{l-1} = \delta_l W_l \odot f'``, with softmax less one-hot on top."""
+def _in_closed_form(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch) -> None:
+    r"""Back-propagation: ``\delta_{l-1} = \delta_l W_l \odot f'``."""
     below, norms = [batch.v], []
     for layer in layers[:-1]:
         activation, norm = _forward(layer, below[-1])
         below.append(activation)
         norms.append(norm)
     top = layers[-1]
-    # Classes before images: the softmax over a last axis of ten is twenty times slower.
-    delta = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1)).softmax(-2)
-    label = batch.label.unsqueeze(-2)
-    delta.scatter_add_(-2, label, delta.new_full((), -1.0).expand(label.shape))
-    delta = delta.mul_(batch.share / batch.label.shape[-1]).mT
+    logits = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1))
+    delta = of_logits(logits, batch.label).mul_(batch.share / batch.label.shape[-1]).mT
     for number in range(len(layers) - 1, -1, -1):
         layer = layers[number]
         if number < len(layers) - 1:
@@ -145,7 +171,5 @@ def _add(parameter: Parameter, gradient: Tensor) -> None:
     parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
 
-def _by_autograd(network: nn.Module, batch: Batch) -> None:
-    logits = network(batch.v)
-    total = F.cross_entropy(logits.flatten(0, -2), batch.label.flatten(), reduction="sum")
-    (total * (batch.share / batch.label.shape[-1])).backward()
+def _by_autograd(network: nn.Module, loss: Loss, batch: Batch) -> None:
+    (loss(network(batch.v), batch.label).sum() * (batch.share / batch.label.shape[-1])).backward()

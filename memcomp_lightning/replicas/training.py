@@ -16,7 +16,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.modules import DivergedError, OptimizerFactory
+from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy
 from memcomp_lightning.modules.stage import diverged_parameter
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.replicas.backprop import gradient_of
@@ -88,8 +88,10 @@ def pretrain(
         _check_finite(rbm, f"pretraining, layer {layer + 1}")
 
 
-def finetune(network: nn.Module, batches: Batches, *, iterations: int, rates: Rates) -> Iterator[int]:
-    """Minimise the cross-entropy of a network in place; yield the number of each pass once it is done.
+def finetune(
+    network: nn.Module, batches: Batches, *, iterations: int, rates: Rates, loss: Loss = cross_entropy
+) -> Iterator[int]:
+    """Minimise the loss of a network in place; yield the number of each pass once it is done.
 
     The network is in evaluation mode while the caller has it, and nothing waits for the device in between.
 
@@ -98,12 +100,13 @@ def finetune(network: nn.Module, batches: Batches, *, iterations: int, rates: Ra
         batches: Its images, with its replica axis.
         iterations: Passes over the training set, >= 1.
         rates: Optimiser and momentum.
+        loss: Of each image.
 
     Raises:
         DivergedError: A parameter left the finite numbers.
     """
     require_count("iterations", iterations)
-    optimizer, add_gradient = rates.optimizer(network.parameters()), gradient_of(network)
+    optimizer, add_gradient = rates.optimizer(network.parameters()), gradient_of(network, loss)
     for iteration in range(iterations):
         network.train()
         rates.begin_pass(optimizer, iteration)

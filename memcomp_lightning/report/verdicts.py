@@ -67,38 +67,37 @@ def _at_last(results: Results, curve: str, passes: int) -> NDArray[np.float64]:
 
 
 def _against_iterations(results: Results, claim: Claim) -> list[Verdict]:
-    first, second = claim.curves
+    judges = [_is_above]
+    if len(results.lengths(claim.better)) > 1:
+        judges.insert(0, _needs_fewer_iterations)
+    return [judge(results, claim, passes) for passes in results.plan.passes for judge in judges]
+
+
+def _needs_fewer_iterations(results: Results, claim: Claim, passes: int) -> Verdict:
     names = results.plan.labels
-    found = []
-    for passes in results.plan.passes:
-        last = results.lengths(second)[-1]
-        after = f"after {passes} passes"
-        arrow = horizontal_arrow(results, claim, passes)
-        goal = results.point(first, results.lengths(first)[-1], passes)
-        free = [
-            curve
-            for curve in results.plan.controls(claim)
-            if results.lengths(curve) == [0] and results.point(curve, 0, passes).mean >= goal.mean
-        ]
-        saved = arrow is not None and arrow[0] < arrow[1]
-        found.append(
-            Verdict(
-                f"{names[second]} needs fewer pretraining iterations than {names[first]} ({after})",
-                f"N = {arrow[0]} instead of {arrow[1]} for {goal.mean:.3f}" if arrow else f"never {goal.mean:.3f}",
-                "",
-                *_verdict(results, saved, free),
-            )
-        )
-        gain = vertical_arrow(results, claim, passes)
-        found.append(
-            Verdict(
-                f"{names[second]} is above {names[first]} at N = {last} ({after})",
-                f"{results.point(second, last, passes)} against {goal}",
-                str(gain),
-                *_verdict(results, gain.is_gain, explaining(results, claim, passes, gain)),
-            )
-        )
-    return found
+    arrow, last = horizontal_arrow(results, claim, passes), results.lengths(claim.than)[-1]
+    goal = results.point(claim.than, last, passes).mean
+    untrained = [curve for curve in results.plan.controls(claim) if results.lengths(curve) == [0]]
+    free = [curve for curve in untrained if results.point(curve, 0, passes).mean >= goal]
+    return Verdict(
+        f"{names[claim.better]} needs fewer pretraining iterations than {names[claim.than]} "
+        f"(after {passes} passes)",
+        f"N = {arrow[0]} instead of {last} for {goal:.3f}" if arrow else f"never {goal:.3f}",
+        "",
+        *_verdict(results, arrow is not None and arrow[0] < arrow[1], free),
+    )
+
+
+def _is_above(results: Results, claim: Claim, passes: int) -> Verdict:
+    names, last = results.plan.labels, results.lengths(claim.better)[-1]
+    gain = vertical_arrow(results, claim, passes)
+    better, than = (results.point(c, results.lengths(c)[-1], passes) for c in (claim.better, claim.than))
+    return Verdict(
+        f"{names[claim.better]} is above {names[claim.than]} at N = {last} (after {passes} passes)",
+        f"{better} against {than}",
+        str(gain),
+        *_verdict(results, gain.is_gain, explaining(results, claim, passes, gain)),
+    )
 
 
 def _against_passes(results: Results, claim: Claim) -> list[Verdict]:

@@ -7,7 +7,7 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear
-from memcomp_lightning.modules import DBNClassifier, score
+from memcomp_lightning.modules import LOSSES, DBNClassifier, cross_entropy, score, squared_error
 from memcomp_lightning.replicas import stacked
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.types import Batch
@@ -28,7 +28,8 @@ def batch(replicas, n=13, share=0.7):
 
 @pytest.mark.parametrize("replicas", [(), (2,), (2, 3)])
 @pytest.mark.parametrize("kind", ["sigmoid", "batch_norm_relu", "baseline"])
-def test_gradient_is_that_of_the_mean_cross_entropy(kind, replicas):
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_gradient_is_that_of_the_mean_loss(loss, kind, replicas):
     def network():
         if kind == "baseline":
             made = BatchNormReluNetwork(7, [5, 3], 11, replicas=replicas, weight_init=Gaussian(std=1.0))
@@ -36,11 +37,11 @@ def test_gradient_is_that_of_the_mean_cross_entropy(kind, replicas):
         return classifier(replicas, kind)
 
     data, quick, slow = batch(replicas), network(), network()
-    add = gradient_of(quick)
+    add = gradient_of(quick, loss)
+    assert add.func.__name__ == "_in_closed_form"
     add(data)
     add(data)  # chunks add up
-    loss = data.share * score(slow(data.v), data.label).mean_loss.sum()
-    (2 * loss).backward()
+    (2 * data.share * score(slow(data.v), data.label, loss).mean_loss.sum()).backward()
     for (name, p), q in zip(quick.named_parameters(), slow.parameters(), strict=True):
         assert (p.grad is None) == (q.grad is None), name
         if q.grad is not None:
@@ -52,6 +53,15 @@ def test_closed_form_is_taken_where_it_exists():
     others = [nn.Identity(), nn.Sequential(Linear(7, 5), Linear(5, 11)), DBN(7, [11]), nn.Sequential()]
     assert all(gradient_of(network).func.__name__ == "_in_closed_form" for network in closed)
     assert all(gradient_of(network).func.__name__ == "_by_autograd" for network in others)
+    assert gradient_of(closed[0], lambda logits, label: logits[..., 0]).func.__name__ == "_by_autograd"
+
+
+def test_losses_are_their_formulas():
+    logits, label = batch((2,)).v.double(), batch((2,)).label % 7
+    by_hand = -torch.log_softmax(logits, -1).gather(-1, label.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(cross_entropy(logits, label), by_hand)
+    target = (torch.arange(7) == label.unsqueeze(-1)).double()
+    torch.testing.assert_close(squared_error(logits, label), 0.5 * (logits.sigmoid() - target).pow(2).sum(-1))
 
 
 @pytest.mark.parametrize("n", [1, 13])

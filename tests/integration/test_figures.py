@@ -167,6 +167,10 @@ def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> 
         ("figure.claims=[{better:memqubo,than:cd1}]", "figure.claims = 'memqubo'"),
         ("figure.against=epochs", "figure.against = 'epochs'"),
         ("+figure.curves.x={label: x, overrides: ['sampler=cdd']}", "cdd"),
+        (
+            "+figure.curves.x={label: x, overrides: [], choose: {setting: pretrain.optimizer.rate, values: [1]}}",
+            "figure.curves.x.choose.setting = 'pretrain.optimizer.rate'",
+        ),
     ],
 )
 def test_wrong_settings_of_a_figure_are_refused_before_training(
