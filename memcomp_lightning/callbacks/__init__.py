@@ -1,5 +1,6 @@
 """Callbacks for any LightningModule that offers the protocol of :mod:`memcomp_lightning.callbacks.base`."""
 
+from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
@@ -12,6 +13,7 @@ from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 
 __all__ = [
+    "BestWeights",
     "ClassificationMetrics",
     "FreeEnergyGap",
     "HyperParameters",

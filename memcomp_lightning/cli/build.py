@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import MomentumSchedule
+from memcomp_lightning.callbacks import BestWeights, MomentumSchedule
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
@@ -56,7 +56,7 @@ class Plan:
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
 _GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks")
 _SETTINGS = {
-    "": (*_GROUPS, "seed", "between_stages", "figure"),
+    "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": _STAGE_SETTINGS,
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),
@@ -98,6 +98,13 @@ def build(config: DictConfig) -> Plan:
         )
     if config.finetune.iterations > 0:
         callbacks = _callbacks(config, "finetune")
+        require(
+            config.data.validation_fraction > 0 or not any(isinstance(c, BestWeights) for c in callbacks),
+            "data.validation_fraction",
+            config.data.validation_fraction,
+            "a share above 0 of the training images where callbacks.finetune has BestWeights",
+            "The test images would choose the pass.",
+        )
         settings: dict[str, Any] = {
             "iterations": config.finetune.iterations,
             "optimizer": _optimizer(config, "finetune", callbacks),

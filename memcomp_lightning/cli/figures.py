@@ -1,6 +1,5 @@
 """A figure of the paper: its curves as networks to train, a record for each as soon as it exists."""
 
-import copy
 import functools
 import json
 import math
@@ -11,26 +10,24 @@ from typing import Any
 from hydra import compose
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from tqdm import tqdm
 
 from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, tuning
 from memcomp_lightning.cli.workers import runner
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.report import Plan, Records
 
-CURVE_SETTINGS = ("label", "overrides", "iterations", "choose", "stop_early")
+CURVE_SETTINGS = ("label", "overrides", "iterations")
 
 
 def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     """Train what is missing for a figure; each record is written when it exists."""
     records = Records(folder)
     write_text(folder / "figure.json", json.dumps(_shown(config, overrides), indent=1) + "\n")
-    # Composed before anything trains: a configuration file that is edited meanwhile changes nothing.
-    composed = {str(n): composed_for((*overrides, *curve.overrides)) for n, curve in config.figure.curves.items()}
+    composed = _curves(config, overrides)
     with runner(config) as run:
         for choosing in (True, False):
             units = plan_units(config, composed, records, choosing=choosing)
@@ -43,6 +40,11 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
 
                 for found in run(units, show):
                     records.append(found)
+
+
+def _curves(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfig]:
+    """Settings of each curve, composed before anything trains: a file edited meanwhile changes nothing."""
+    return {str(n): composed_for((*overrides, *curve.overrides)) for n, curve in config.figure.curves.items()}
 
 
 def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictConfig, list[str]]]:
@@ -58,7 +60,7 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
     """What the report needs to know of the settings: ``report.Plan``."""
     figure = OmegaConf.to_container(config.figure, resolve=True)
     assert isinstance(figure, dict)
-    curves = figure["curves"]
+    curves, composed = figure["curves"], _curves(config, overrides)
     data = build(composed_for((*overrides, "pretrain.iterations=1", "finetune.iterations=1"))).stages[0].data
     claimed = [name for claim in figure["claims"] for name in (claim["than"], claim["better"]) if name in curves]
     n_parts = math.prod(data.replicas)
@@ -73,8 +75,8 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
         "passes": sorted(figure["passes"]),
         "claims": figure["claims"],
         "labels": {name: curves[name]["label"] for name in dict.fromkeys((*claimed, *curves))},
-        "chosen": {name: curve["choose"]["setting"] for name, curve in curves.items() if "choose" in curve},
-        "stop_early": [name for name, curve in curves.items() if curve.get("stop_early", False)],
+        "chosen": {name: own.choose.setting for name, own in composed.items() if tried_values(own)},
+        "stop_early": [name for name, own in composed.items() if own.callbacks.finetune.get("best_weights")],
         "scale": ", ".join(part for part in (whole, parts, seeds) if part),
     }
 
@@ -89,15 +91,9 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for name, curve in config.figure.curves.items():
         for key in curve:
             require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)
-        composed = composed_for((*overrides, *curve.overrides))
-        if "choose" in curve:
-            try:
-                composed = _with_choice(composed, curve.choose.setting, curve.choose["values"][0])
-            except OmegaConfBaseException as error:
-                raise UserError(
-                    f"figure.curves.{name}.choose.setting = {curve.choose.setting!r}: {error}"
-                ) from error
-        build(composed)
+    for settings in _curves(config, overrides).values():
+        values = tried_values(settings)
+        build(for_trial(settings, values[0]) if values else settings)
 
 
 def plan_units(
@@ -127,8 +123,8 @@ def _members(
     curve = config.figure.curves[name]
     iterations, seeds = list(curve.get("iterations", config.figure.iterations)), list(config.figure.seeds)
     values: list[float | None] = [None]
-    if "choose" in curve:
-        values = [*curve.choose["values"]] if choosing else [records.best_choice(name)]
+    if tried := tried_values(composed):
+        values = [*tried] if choosing else [records.best_choice(name)]
     elif choosing:
         return
     for value in values:
@@ -136,9 +132,9 @@ def _members(
             iterations, seeds = iterations[-1:], seeds[:1]
         missing = [(n, s) for n in iterations for s in seeds if not records.has(name, value, choosing, n, s)]
         if missing:
-            settings = composed if value is None else _with_choice(composed, curve.choose.setting, value)
-            if choosing:
-                settings.data.validation_fraction = 0.1
+            settings = composed
+            if value is not None:
+                settings = for_trial(composed, value) if choosing else with_choice(composed, value)
             plain: Any = OmegaConf.to_container(settings, resolve=False)
             yield from (Member(name, plain, n, seed, value, choosing) for n, seed in missing)
 
@@ -157,13 +153,6 @@ def composed_for(overrides: tuple[str, ...]) -> DictConfig:
         composed = compose("config", [o for o in own if _applies(o.partition("=")[0], bare)])
     composed.figure = None
     return composed
-
-
-def _with_choice(composed: DictConfig, setting: str, value: float) -> DictConfig:
-    """A copy in which a setting has the value, one that begins with ``+`` is added."""
-    settings = copy.deepcopy(composed)
-    OmegaConf.update(settings, setting.lstrip("+"), value, force_add=setting.startswith("+"))
-    return settings
 
 
 def _applies(name: str, config: DictConfig) -> bool:

@@ -25,7 +25,13 @@ from memcomp_lightning.modules.weights import AtomicCheckpointIO, check_fits, re
 log = logging.getLogger(__name__)
 
 
-def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, str]) -> dict[str, Any]:
+def run(
+    plan: Plan,
+    config: DictConfig,
+    folder: RunFolder,
+    overrides: dict[str, str],
+    choice: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Train what is not trained yet, evaluate, and return the result.
 
     Every stage that is done left its weights; an interrupted one goes on from its last checkpoint.
@@ -51,6 +57,8 @@ def run(plan: Plan, config: DictConfig, folder: RunFolder, overrides: dict[str, 
         if stage is plan.pretraining:
             _between(plan, config)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
+    if choice is not None:
+        result["choice"] = choice
     if plan.finetuning is not None:
         module = plan.finetuning.module
         assert isinstance(module, Classifier)

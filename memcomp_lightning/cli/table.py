@@ -38,7 +38,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 
 def run_table(result: dict[str, Any]) -> str:
-    """Energy gap, test accuracy and wall time of each stage of one run."""
+    """Energy gap, test accuracy and wall time of each stage of one run, and what held-out images chose for it."""
     rows = [["stage", "iterations", "energy gap (data - model)", "test accuracy", "wall time"]]
     for name, record in result["stages"].items():
         gaps = record.get("energy_gap", [])
@@ -47,7 +47,9 @@ def run_table(result: dict[str, Any]) -> str:
         if not gaps:
             rows.append([name, str(record["iterations"]), "", with_error(result["test_accuracy"]), ""])
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"
-    return aligned(rows)
+    choice = result.get("choice")
+    chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
+    return aligned(rows) + chosen
 
 
 def closing_lines(folder: Path) -> str:

@@ -17,11 +17,12 @@ from omegaconf import DictConfig
 
 from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory
 from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
-from memcomp_lightning.errors import SettingError
+from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.modules import CheckpointError, DivergedError
 
 COMMAND = "memcomp-train"
@@ -54,7 +55,10 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
             check = trajectory.prepare if "curves" not in part.figure else figures.check
             check(part, own)
         return
-    plan = build(config)
+    values = tried_values(config)
+    n_passes = config.finetune.iterations
+    require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
+    plan = build(for_trial(config, values[0]) if values else config)
     try:
         trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
     except MisconfigurationException as error:
@@ -67,13 +71,13 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     if config.figure is not None:
         _figure(config, folder, overrides)
         return
-    plan = build(config)
     if _is_first_process():
         folder.open(config, overrides)
     result = folder.result
     if result is None:
         try:
-            result = pipeline.run(plan, config, folder, _by_name(overrides))
+            config, choice = settle(config, folder)
+            result = pipeline.run(build(config), config, folder, _by_name(overrides), choice)
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
             raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
     else:

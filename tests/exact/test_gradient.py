@@ -4,10 +4,12 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, Exact, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
+from memcomp_lightning.types import NoState
 
 SIZES = [(7, 5), (5, 7)]
 REPLICAS = [(), (3,), (2, 3)]
@@ -55,6 +57,32 @@ def test_contrast_with_one_sweep_is_not_the_likelihood_gradient():
     rbm = small_rbm().double()
     ours, true = gradients(rbm, CD(k=1), data(rbm, binary=True))
     assert (ours[0] - true[0]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_last_half_sweep_of_cd_keeps_what_it_is_told(k):
+    """The draw of a unit follows its mean: both are had from one random stream."""
+    rbm = small_rbm().double()
+    positive = positive_phase(rbm, data(rbm, binary=True))
+
+    def sample(generator, **readouts):
+        return CD(k=k, **readouts).sample(rbm, NoState(), positive, generator=generator).configurations
+
+    generator = rng.stream(0, "negative_phase")
+    means = sample(generator, visible="mean")
+    assert ((means.v > 0) & (means.v < 1)).all()
+    torch.testing.assert_close(means.h, rbm.hidden_mean(means.v))
+    drawn = rng.bernoulli(means.v, generator=generator)
+    usual = sample(rng.stream(0, "negative_phase"))
+    assert usual.v.equal(drawn)
+    assert usual.h.equal(rbm.hidden_mean(drawn))
+    generator = rng.stream(0, "negative_phase")
+    sampled = sample(generator, hidden="sample")
+    assert sampled.v.equal(usual.v)
+    assert ((sampled.h == 0) | (sampled.h == 1)).all()
+    assert not sampled.h.equal(rng.bernoulli(usual.h, generator=generator))
+    with pytest.raises(SettingError, match="visible = 'median'"):
+        CD(visible="median")
 
 
 def test_contrast_changes_by_the_likelihood_ratio_to_first_order():

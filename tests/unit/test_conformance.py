@@ -36,6 +36,7 @@ SOLVERS = {
 SAMPLERS = {
     "CD-1": CD(),
     "CD-3": CD(k=3),
+    "CD-1 of means": CD(visible="mean", hidden="sample"),
     "PCD": PCD(),
     "PCD with its own chains": PCD(k=3, n_chains=23),
     "exact": Exact(),

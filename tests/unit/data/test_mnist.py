@@ -63,6 +63,14 @@ def test_reduced_is_the_reduction_of_grey(files, folder, write):
     assert ReducedMnist(**settings).load().test_v.equal(reduce_images(grey.view(3, 28, 28)))
 
 
+def test_reduced_pixels_are_those_of_the_reduced_image(files, folder, write):
+    write(folder, files)
+    settings = {"data_dir": str(folder.parents[1]), "download": False}
+    grey, above = ReducedMnist(**settings).load(), ReducedMnist(**settings, pixels="threshold").load()
+    assert above.train_v.equal((grey.train_v > 0.5).float())
+    assert above.name == "reduced_mnist_threshold"
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

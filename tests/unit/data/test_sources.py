@@ -63,6 +63,15 @@ def test_digits_are_the_pixels_of_the_picture():
     torch.testing.assert_close(mine.sum(dim=0), expected.sum(dim=0))
 
 
+def test_digits_as_bits():
+    grey, above = Digits().load(), Digits(pixels="threshold", threshold=0.25).load()
+    assert above.train_v.equal((grey.train_v > 0.25).float())
+    assert above.test_v.equal((grey.test_v > 0.25).float())
+    assert above.name == "digits_threshold"
+    with pytest.raises(SettingError, match="pixels = 'binary'"):
+        Digits(pixels="binary")
+
+
 def test_shifting_bars():
     data = ShiftingBars().load()
     assert data.train_v.shape == (9, 9)

@@ -1,0 +1,74 @@
+"""Early stopping in hindsight: the weights of the pass that did best on held-out images."""
+
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from memcomp_lightning.callbacks.base import required
+
+
+class BestWeights(pl.Callback):
+    """Keeps the weights of the pass with the highest accuracy on held-out images, and puts them back at the end.
+
+    Works with any module whose ``validation_step`` returns a dictionary with ``score``
+    (:class:`memcomp_lightning.modules.Score`). Replicas keep a pass each: their tensors begin with the axes of the
+    accuracy. Of passes that are equal the first one stays. The state is in checkpoints.
+
+    Attributes:
+        accuracy: The highest so far, ``(*replicas,)``; None before the first pass.
+    """
+
+    def __init__(self) -> None:
+        self.accuracy: Tensor | None = None
+        self._weights: dict[str, Tensor] = {}
+        self._score: Any = None
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new sum."""
+        self._score = None
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Add a batch."""
+        score = required(outputs, "score", self)
+        self._score = score if self._score is None else self._score + score
+
+    @torch.no_grad()
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Keep the weights of the replicas that are better than ever."""
+        if self._score is None or trainer.sanity_checking:
+            return
+        # Every process must come to the same weights: they judge by the images of all.
+        counts = self._score.n_correct.float(), torch.tensor(float(self._score.n_images), device=pl_module.device)
+        n_correct, n_images = (trainer.strategy.reduce(count, reduce_op="sum") for count in counts)
+        accuracy = n_correct / n_images
+        better = torch.ones_like(accuracy, dtype=torch.bool)
+        if self.accuracy is not None:
+            better = accuracy > self.accuracy.to(accuracy)
+            accuracy = torch.where(better, accuracy, self.accuracy.to(accuracy))
+        self.accuracy = accuracy
+        for name, now in pl_module.state_dict().items():
+            own = better.view((*better.shape, *[1] * (now.ndim - better.ndim)))
+            self._weights[name] = torch.where(own, now, self._weights.get(name, now).to(now))
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Put the best weights back."""
+        if self._weights:
+            pl_module.load_state_dict(self._weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Accuracies and weights."""
+        return {"accuracy": self.accuracy, "weights": self._weights}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`."""
+        self.accuracy, self._weights = state_dict["accuracy"], state_dict["weights"]

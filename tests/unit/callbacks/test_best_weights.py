@@ -1,0 +1,88 @@
+"""The weights of the best pass, a pass of its own for each replica."""
+
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import pytest
+import torch
+from torch.utils.data import DataLoader, TensorDataset
+
+from memcomp_lightning.callbacks import BestWeights
+from memcomp_lightning.modules import Score
+
+N_CORRECT = torch.tensor([[3, 5], [7, 2], [7, 8], [1, 8]])
+"""Of ten held-out images, by pass and replica."""
+
+
+class Counter(pl.LightningModule):
+    """Its weight is the number of the pass, for both replicas."""
+
+    def __init__(self, replicas: tuple[int, ...] = (2,)) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(*replicas, 3))
+        self.register_buffer("seen", torch.zeros(replicas))
+        self.automatic_optimization = False
+
+    def training_step(self, batch: Any, batch_idx: int) -> None:
+        with torch.no_grad():
+            self.weight += 1
+            self.seen += 1
+
+    def validation_step(self, batch: Any, batch_idx: int) -> dict[str, Any]:
+        n_correct = N_CORRECT[self.current_epoch]
+        if self.weight.ndim == 1:
+            n_correct = n_correct[0]
+        return {"score": Score(torch.zeros_like(n_correct).float(), n_correct, 10)}
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def fit(module: Counter, folder: Path, n_passes: int, resume_from: Path | None = None) -> Any:
+    loader = DataLoader(TensorDataset(torch.zeros(1, 1)))
+    quiet = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
+    trainer = pl.Trainer(
+        max_epochs=n_passes,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[BestWeights()],
+        num_sanity_val_steps=1,
+        default_root_dir=folder,
+        **quiet,
+    )
+    trainer.fit(module, loader, loader, ckpt_path=resume_from, weights_only=True)
+    return trainer
+
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),
+    pytest.mark.usefixtures("allow_global_rng"),  # torch's DataLoader draws a base seed
+]
+
+
+def test_each_replica_ends_with_its_best_pass(tmp_path: Path) -> None:
+    module = Counter()
+    fit(module, tmp_path, 4)
+    assert module.weight.tolist() == [[2, 2, 2], [3, 3, 3]]  # the first of equal passes
+    assert module.seen.tolist() == [2, 3]
+    alone = Counter(replicas=())
+    fit(alone, tmp_path, 4)
+    assert alone.weight.tolist() == [2, 2, 2]
+
+
+def test_the_best_pass_before_an_interruption_counts(tmp_path: Path) -> None:
+    class StoppedError(Exception):
+        pass
+
+    class Fails(Counter):
+        def on_train_epoch_start(self) -> None:
+            if self.current_epoch == 2:
+                self.trainer.save_checkpoint(tmp_path / "last.ckpt")
+                raise StoppedError
+
+    with pytest.raises(StoppedError):
+        fit(Fails(), tmp_path, 4)
+    module = Counter()
+    fit(module, tmp_path, 4, tmp_path / "last.ckpt")
+    assert module.weight.tolist() == [[2, 2, 2], [3, 3, 3]]
