@@ -8,10 +8,11 @@ from typing import NamedTuple
 from memcomp_lightning.report.verdicts import HOLDS, ONLY, RULE, Verdict
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-img { max-width: 100%; height: auto; display: block; margin: 1rem 0 }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+img { max-width: min(100%, 56rem); height: auto; display: block; margin: 1rem 0 }
 table { border-collapse: collapse; display: block; overflow-x: auto }
 td, th { border-bottom: 1px solid #ddd; padding: .3rem .7rem; text-align: left; vertical-align: top }
+td:last-child { min-width: 26rem; font-size: .9em }
 td.fails { color: #a33 } td.only { color: #96690a } td.holds { color: #17703c }
 pre, small { color: #555 }
 """
@@ -65,11 +66,11 @@ def _section(section: Section) -> str:
     rows = "\n".join(_row(verdict) for verdict in section.verdicts)
     table = f"<table><tr>{''.join(f'<th>{name}</th>' for name in _HEADER)}</tr>\n{rows}</table>" if rows else ""
     notes = "<br>".join(escape(note) for note in section.notes)
-    return f"<h2>{escape(section.title)}</h2>\n{table}\n{pictures}\n<p><small>{notes}</small></p>"
+    return f"<h2>{escape(section.title)}</h2>\n{pictures}\n{table}\n<p><small>{notes}</small></p>"
 
 
 def _row(verdict: Verdict) -> str:
     kind = {HOLDS: "holds", ONLY: "only"}.get(verdict.verdict, "fails")
     cells = "".join(f"<td>{escape(cell)}</td>" for cell in verdict[:3])
-    controls = "<br>".join(escape(control) for control in verdict.explained_by)
+    controls = escape("; ".join(verdict.explained_by))
     return f'<tr>{cells}<td class="{kind}">{escape(verdict.verdict)}</td><td>{controls}</td></tr>'

@@ -125,7 +125,7 @@ def test_gap_holds_only_without_the_control_that_reaches_it(tmp_path):
     only_weak = results(
         tmp_path / "a", record("cd", [cd] * 2), record("mem", [mem] * 2), record("shuffled", [weak] * 2)
     )
-    gap = verdicts(only_weak)[1]
+    (gap, _) = verdicts(only_weak)  # a row for 10 and for 20 passes
     assert gap.verdict == HOLDS
     assert gap.test.startswith("+.5")
     both = results(
@@ -135,12 +135,32 @@ def test_gap_holds_only_without_the_control_that_reaches_it(tmp_path):
         record("shuffled", [explained] * 2),
         record("free", [mem] * 2, iterations=0),
     )
-    assert verdicts(both)[1][-2:] == ("holds only without controls", ("shuffled", "no pretraining"))
-    assert verdicts(both)[0].verdict == "does not hold"  # no iteration is saved: both were measured at N = 5 alone
+    assert verdicts(both)[0][-2:] == ("holds only without controls", ("shuffled", "no pretraining"))
     swapped = results(tmp_path / "c", record("cd", [mem] * 2), record("mem", [cd] * 2))
-    assert verdicts(swapped)[1].verdict == "does not hold"
+    assert verdicts(swapped)[0].verdict == "does not hold"
     nothing = results(tmp_path / "d", record("cd", [mem] * 2), record("mem", [mem + 0.1 * noise(7, seed=4)] * 2))
-    assert verdicts(nothing)[1].verdict == "does not hold"
+    assert verdicts(nothing)[0].verdict == "does not hold"
+
+
+def test_fewer_iterations_are_none_where_no_iteration_is_needed(tmp_path):
+    def measured(folder, *more, first=0.8):
+        lengths = [record("mem", first, 1), record("mem", 0.8, 5)]
+        return verdicts(results(tmp_path / folder, record("cd", 0.5), *lengths, *more))[0]
+
+    saved = measured("a")
+    assert (saved.measured, saved.verdict) == ("N = 1 instead of 5 for 0.500", HOLDS)
+    assert measured("b", first=0.3).verdict == "does not hold"  # N = 5, as the other one
+    free = measured("c", record("free", 0.6, 0))
+    assert free[-2:] == ("holds only without controls", ("no pretraining",))
+    assert measured("d", record("free", 0.4, 0)).verdict == HOLDS
+
+
+def test_a_claim_has_controls_of_its_own(tmp_path):
+    others = Claim(better="shuffled", than="free", controls=("cd",))
+    made = plan(claims=[CLAIM, others])
+    assert made.controls(others) == ["cd"]
+    assert made.controls(CLAIM) == []
+    assert plan().controls(CLAIM) == ["shuffled", "free"]
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(0.03, [HOLDS] * 3), (0.012, ["does not hold"] * 2 + [HOLDS])])
