@@ -1,12 +1,45 @@
 """The one loss for every sampler of the negative phase."""
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.errors import require
 from memcomp_lightning.types import Configurations
+
+
+class Offsets(NamedTuple):
+    """Centres of the units, ``(*replicas, n_visible)`` and ``(*replicas, n_hidden)``."""
+
+    visible: Tensor
+    hidden: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Centring:
+    """Settings of the centred gradient: the means of the positive phase, followed update by update.
+
+    Montavon & Mueller 2012; Melchior, Fischer & Wiskott 2016 ("dd", with the sliding average that they recommend).
+
+    Attributes:
+        rate: Weight of the newest update in the offsets, in (0, 1].
+    """
+
+    rate: float = 0.01
+
+    def __post_init__(self) -> None:
+        require(0 < self.rate <= 1, "centring rate", self.rate, "a number in (0, 1]")
+
+    def follow(self, offsets: Offsets | None, positive: Configurations) -> Offsets:
+        """Return the offsets for an update; the first ones are the means of its positive phase."""
+        weight = shares(positive).unsqueeze(-1)
+        now = Offsets((positive.v * weight).sum(-2), (positive.h * weight).sum(-2))
+        if offsets is None:
+            return now
+        return Offsets(*(old.lerp(new, self.rate) for old, new in zip(offsets, now, strict=True)))
 
 
 class HasTotalEnergy(Protocol):
@@ -17,25 +50,47 @@ class HasTotalEnergy(Protocol):
         ...
 
 
+class HasCentredEnergy(HasTotalEnergy, Protocol):
+    """An energy model that knows its centred parametrisation."""
+
+    def centred_total_energy(
+        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    ) -> Tensor:
+        """The same sum; its gradient is that of the centred parametrisation, in the model's own parameters."""
+        ...
+
+
 def contrast(
-    model: HasTotalEnergy, positive: Configurations, negative: Configurations
+    model: HasTotalEnergy,
+    positive: Configurations,
+    negative: Configurations,
+    offsets: Offsets | None = None,
 ) -> Float[Tensor, "*replicas"]:
-    """Return ``mean E(positive) - mean E(negative)`` for each replica, means by the weights.
+    r"""Return ``mean E(positive) - mean E(negative)`` for each replica, means by the weights.
 
     With the hidden means given the data as the positive phase and the exact expectation as the negative
     one, its gradient is the gradient of the mean negative log-likelihood (eqs. 4 to 6 of Manukian et al.
     2019, with the sign of a loss). Both phases are constants to autograd. Sum it over the replicas before
     the backward pass: they stay independent.
 
+    With ``offsets`` the value is the same and the gradient is that of a model whose units are centred,
+    :math:`E = -(h - \lambda)^T W (v - \mu) - b'^T v - c'^T h`: it does not change when units are flipped, zero for
+    one, and is better conditioned. In the parameters of the plain energy, for offsets :math:`\mu, \lambda` that
+    stand still, its step is that of :math:`\nabla W`, :math:`\nabla b' - \nabla W^T \lambda` and
+    :math:`\nabla c' - \nabla W \mu`, where :math:`\nabla W` is made of :math:`(h - \lambda)(v - \mu)^T`.
+
     Args:
-        model: The energy model.
+        model: The energy model; with ``offsets`` it offers ``centred_total_energy`` as well.
         positive: Configurations with the data clamped.
         negative: Configurations that stand for the model's own distribution.
+        offsets: From :meth:`Centring.follow`; None leaves the units as they are.
     """
     weight = torch.cat((shares(positive), -shares(negative)), dim=-1)
     v = torch.cat((positive.v, negative.v), dim=-2)
     h = torch.cat((positive.h, negative.h), dim=-2)
-    return model.total_energy(v, h, weight)
+    if offsets is None:
+        return model.total_energy(v, h, weight)
+    return cast(HasCentredEnergy, model).centred_total_energy(v, h, weight, *offsets)
 
 
 def shares(configurations: Configurations) -> Tensor:

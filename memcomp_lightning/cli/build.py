@@ -58,7 +58,7 @@ _GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "traine
 _SETTINGS = {
     "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
-    "pretrain": _STAGE_SETTINGS,
+    "pretrain": (*_STAGE_SETTINGS, "centring"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),
     "callbacks": ("pretrain", "finetune"),
 }
@@ -91,6 +91,7 @@ def build(config: DictConfig) -> Plan:
                 instantiate(config.sampler),
                 iterations=config.pretrain.iterations,
                 optimizer=_optimizer(config, "pretrain", callbacks),
+                centring=instantiate(config.pretrain.centring),
                 seed=seed,
             ),
             _data(config, "pretrain", images),

@@ -180,6 +180,7 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
             module.sampler,
             iterations=module.iterations,
             rates=rates_of(stage),
+            centring=module.centring,
             seed=seed,
         )
     if plan.between is not None and isinstance(network, DBN):

@@ -102,6 +102,27 @@ class RBM(nn.Module):
         biases: Tensor = vecdot(self.b, sum_v) + vecdot(self.c, sum_h)
         return -(coupled + biases)
 
+    def centred_total_energy(
+        self,
+        v: Float[Tensor, "*replicas n n_visible"],
+        h: Float[Tensor, "*replicas n n_hidden"],
+        weight: Float[Tensor, "*replicas n"],
+        visible_offset: Float[Tensor, "*replicas n_visible"],
+        hidden_offset: Float[Tensor, "*replicas n_hidden"],
+    ) -> Float[Tensor, "*replicas"]:
+        """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of the centred RBM."""
+        with torch.no_grad():
+            value = self.total_energy(v, h, weight)
+            centred_v = v - visible_offset.unsqueeze(-2)
+            weighted_h = (h - hidden_offset.unsqueeze(-2)) * weight.unsqueeze(-1)
+            of_weight = weighted_h.mT @ centred_v
+            of_b = (centred_v * weight.unsqueeze(-1)).sum(-2)
+            of_b -= (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
+            of_c = weighted_h.sum(-2) - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
+        coupled: Tensor = vecdot(self.weight.flatten(-2), of_weight.flatten(-2))
+        surrogate: Tensor = -(coupled + vecdot(self.b, of_b) + vecdot(self.c, of_c))
+        return value + (surrogate - surrogate.detach())
+
     def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
         r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
         return -F.softplus(self.hidden_field(v)).sum(-1) - (v * self.b.unsqueeze(-2)).sum(-1)
@@ -119,15 +140,15 @@ class RBM(nn.Module):
         return affine(h, self.weight.mT, self.b)
 
     def hidden_mean(
-        self, v: Float[Tensor, "*replicas n n_visible"], *, beta: float = 1.0
+        self, v: Float[Tensor, "*replicas n n_visible"], *, beta: float | Tensor = 1.0
     ) -> Float[Tensor, "*replicas n n_hidden"]:
-        """p(h = 1 | v) at inverse temperature ``beta`` (eq. 7)."""
+        """p(h = 1 | v) at inverse temperature ``beta`` (eq. 7), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.hidden_field(v), beta))
 
     def visible_mean(
-        self, h: Float[Tensor, "*replicas n n_hidden"], *, beta: float = 1.0
+        self, h: Float[Tensor, "*replicas n n_hidden"], *, beta: float | Tensor = 1.0
     ) -> Float[Tensor, "*replicas n n_visible"]:
-        """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8)."""
+        """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.visible_field(h), beta))
 
     def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
@@ -135,6 +156,6 @@ class RBM(nn.Module):
         return self.hidden_mean(v)
 
 
-def _scaled(field: Tensor, beta: float) -> Tensor:
+def _scaled(field: Tensor, beta: float | Tensor) -> Tensor:
     """Field times beta, without a pass over memory in the usual case."""
-    return field if beta == 1.0 else beta * field
+    return field if isinstance(beta, float) and beta == 1.0 else beta * field

@@ -13,8 +13,8 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
-from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
+from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of, with_tensors
 from memcomp_lightning.types import Batch, Configurations, NegativePhase
 
 
@@ -30,6 +30,7 @@ class DBNPretraining(StageModule):
         sampler: Supplies the negative phase.
         iterations: Passes over the training set for each layer, >= 1.
         optimizer: Builds the optimiser of one layer from its parameters.
+        centring: Settings of the centred gradient; None follows the plain one.
         seed: Seed of the random streams.
 
     Attributes:
@@ -49,6 +50,7 @@ class DBNPretraining(StageModule):
         *,
         iterations: int = 50,
         optimizer: OptimizerFactory = PAPER_SGD,
+        centring: Centring | None = None,
         seed: int = 0,
     ) -> None:
         require_count("pretrain.iterations", iterations)
@@ -57,8 +59,10 @@ class DBNPretraining(StageModule):
             sampler.init(rbm, 1, generator=rng.stream(seed, "check"))
         self.dbn = dbn
         self.sampler = sampler
+        self.centring = centring
         self.energy_gaps: list[Tensor] = []
         self._sampler_state: Any = None
+        self._offsets: Offsets | None = None
         self._negative: NegativePhase[Any] | None = None
         self._gap: Tensor | float = 0.0
 
@@ -109,7 +113,7 @@ class DBNPretraining(StageModule):
     def on_train_epoch_start(self) -> None:
         """A new layer starts without chains."""
         if self.iteration == 0:
-            self._sampler_state = None
+            self._sampler_state, self._offsets = None, None
             self.energy_gaps = [*self.energy_gaps, torch.zeros(self.dbn.replicas)]
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
@@ -122,10 +126,13 @@ class DBNPretraining(StageModule):
         rbm = self.rbm
         with torch.no_grad():
             positive = positive_phase(rbm, self.dbn.visible_of(self.layer, batch.v))
+        if self._negative is None and self.centring is not None:
+            offsets = self.centring.follow(self._offsets, positive)
+            self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))
         if self._negative is None or self.sampler.uses_data:
             self._negative = self._negative_phase(rbm, positive)
         negative = self._negative
-        gap = contrast(rbm, positive, negative.configurations)
+        gap = contrast(rbm, positive, negative.configurations, self._offsets)
         loss = batch.share * gap.sum()
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
         self._gap = self._gap + batch.share * gap.detach()
@@ -172,15 +179,18 @@ class DBNPretraining(StageModule):
         return (p for layer, rbm in enumerate(self.dbn) if layer != self.layer for p in rbm.parameters())
 
     def extra_state(self) -> dict[str, Any]:
-        """The sampler's chains and the energy gaps."""
-        chains = None if self._sampler_state is None else dict(self._sampler_state._asdict())
-        state = {"sampler": chains, "energy_gaps": list(self.energy_gaps)}
+        """The sampler's chains, the offsets and the energy gaps."""
+        chains = None if self._sampler_state is None else tensors_of(self._sampler_state)
+        offsets = None if self._offsets is None else self._offsets._asdict()
+        state = {"sampler": chains, "offsets": offsets, "energy_gaps": list(self.energy_gaps)}
         return cast(dict[str, Any], move_data_to_device(state, "cpu"))
 
     def take_extra_state(self, state: dict[str, Any]) -> None:
-        """Take back the sampler's chains and the energy gaps."""
+        """Take back the sampler's chains, the offsets and the energy gaps."""
         self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
+        if state["offsets"] is not None:
+            self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
         if state["sampler"] is not None:
             template = self.sampler.init(self.rbm, 1, generator=rng.stream(self.seed, "check"))
             chains = {name: tensor.to(self.device) for name, tensor in state["sampler"].items()}
-            self._sampler_state = type(template)(**chains)
+            self._sampler_state = with_tensors(template, chains)

@@ -18,7 +18,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy
 from memcomp_lightning.modules.stage import diverged_parameter
-from memcomp_lightning.objective import contrast
+from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
 from memcomp_lightning.types import NegativePhase
@@ -49,6 +49,7 @@ def pretrain(
     *,
     iterations: int,
     rates: Rates,
+    centring: Centring | None = None,
     seed: int = 0,
 ) -> None:
     """Train each RBM of a DBN in place on the mean activations of the layers below it.
@@ -59,6 +60,7 @@ def pretrain(
         sampler: Supplies the negative phase.
         iterations: Passes over the training set for each layer, >= 0.
         rates: Optimiser and momentum of each layer.
+        centring: Settings of the centred gradient; None follows the plain one.
         seed: Of the negative phase.
 
     Raises:
@@ -68,6 +70,7 @@ def pretrain(
     generator = rng.stream(seed, "negative_phase")
     for layer, rbm in enumerate(dbn):
         optimizer, state = rates.optimizer(rbm.parameters()), None
+        offsets: Offsets | None = None
         for iteration in range(iterations):
             rates.begin_pass(optimizer, iteration)
             batches.set_epoch(layer * iterations + iteration)
@@ -77,10 +80,12 @@ def pretrain(
                     positive = positive_phase(rbm, dbn.visible_of(layer, batch.v))
                 if state is None:
                     state = sampler.init(rbm, positive.v.shape[-2], generator=generator)
+                if negative is None and centring is not None:
+                    offsets = centring.follow(offsets, positive)
                 if negative is None or sampler.uses_data:
                     negative = sampler.sample(rbm, state, positive, generator=generator)
                     state = negative.state
-                (batch.share * contrast(rbm, positive, negative.configurations).sum()).backward()
+                (batch.share * contrast(rbm, positive, negative.configurations, offsets).sum()).backward()
                 if batch.closes_step:
                     optimizer.step()
                     optimizer.zero_grad()

@@ -1,13 +1,42 @@
 """What a sampler of the negative phase is."""
 
-from typing import ClassVar, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol, TypeVar
 
-from torch import Generator
+from torch import Generator, Tensor
 
 from memcomp_lightning.types import Configurations, NegativePhase
 
 ModelT = TypeVar("ModelT", contravariant=True)
 StateT = TypeVar("StateT")
+
+
+def tensors_of(state: Any) -> dict[str, Tensor]:
+    """The tensors of a sampler's state by dotted names; states may hold states.
+
+    >>> from memcomp_lightning.types import NoState
+    >>> tensors_of(NoState())
+    {}
+    """
+    found: dict[str, Tensor] = {}
+    for name, value in state._asdict().items():
+        if isinstance(value, Tensor):
+            found[name] = value
+        else:
+            found |= {f"{name}.{inner}": tensor for inner, tensor in tensors_of(value).items()}
+    return found
+
+
+def with_tensors(state: StateT, tensors: Mapping[str, Tensor]) -> StateT:
+    """Inverse of :func:`tensors_of`: a state like ``state`` that holds these tensors."""
+    values: dict[str, Any] = {}
+    for name, value in state._asdict().items():  # type: ignore[attr-defined]
+        if isinstance(value, Tensor):
+            values[name] = tensors[name]
+        else:
+            inner = {key.removeprefix(f"{name}."): t for key, t in tensors.items() if key.startswith(f"{name}.")}
+            values[name] = with_tensors(value, inner)
+    return type(state)(**values)
 
 
 class NegativePhaseSampler(Protocol[ModelT, StateT]):

@@ -27,11 +27,11 @@ class TwoLayerModel(Protocol):
         """Visible bias; gives dtype and device."""
         ...
 
-    def hidden_mean(self, v: Tensor, *, beta: float = 1.0) -> Tensor:
+    def hidden_mean(self, v: Tensor, *, beta: float | Tensor = 1.0) -> Tensor:
         """p(h = 1 | v)."""
         ...
 
-    def visible_mean(self, h: Tensor, *, beta: float = 1.0) -> Tensor:
+    def visible_mean(self, h: Tensor, *, beta: float | Tensor = 1.0) -> Tensor:
         """p(v = 1 | h)."""
         ...
 

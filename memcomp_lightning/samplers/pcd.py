@@ -6,7 +6,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible, sweep
 from memcomp_lightning.types import Configurations, NegativePhase
 
@@ -23,8 +23,9 @@ class PCD:
 
     Attributes:
         k: Sweeps an update, >= 1.
-        n_chains: Chains a replica, >= 1; None takes as many as there are images in the batch
+        n_chains: Chains a replica, >= 1; None takes ``chains_per_datum`` for each image in the batch
             (the chunk, of this process) at hand.
+        chains_per_datum: >= 1, used where ``n_chains`` is None.
     """
 
     uses_data: ClassVar[bool] = False
@@ -32,15 +33,22 @@ class PCD:
 
     k: int = 1
     n_chains: int | None = None
+    chains_per_datum: int = 1
 
     def __post_init__(self) -> None:
         require_count("k", self.k)
+        require_count("chains_per_datum", self.chains_per_datum)
+        per_datum, allowed = self.chains_per_datum, "1 where n_chains is given"
+        require(
+            per_datum == 1 or self.n_chains is None, "chains_per_datum", per_datum, allowed, "Use n_chains=null."
+        )
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
 
     def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> Chains:
         """Start the chains at random states."""
-        return Chains(random_visible(model, self.n_chains or n_chains, generator=generator))
+        n = self.n_chains or n_chains * self.chains_per_datum
+        return Chains(random_visible(model, n, generator=generator))
 
     @torch.no_grad()
     def sample(

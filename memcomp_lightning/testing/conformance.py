@@ -10,7 +10,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.models import RBM, Gaussian
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
-from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
+from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of
 from memcomp_lightning.types import Configurations
 
 
@@ -48,10 +48,10 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
         for _ in range(2):
             generator = rng.stream(2, "negative_phase")
             state = sampler.init(rbm, n_data, generator=generator)
-            kept = tuple(tensor.clone() for tensor in state)
+            kept = [tensor.clone() for tensor in tensors_of(state).values()]
             answers.append(sampler.sample(rbm, state, positive, generator=generator))
             _check(
-                all(a.equal(b) for a, b in zip(kept, state, strict=True)),
+                all(a.equal(b) for a, b in zip(kept, tensors_of(state).values(), strict=True)),
                 f"{name} changed the state it was given; return a new one",
             )
         _check(global_state.equal(torch.get_rng_state()), f"{name} drew from torch's global random stream")

@@ -1,15 +1,18 @@
 """The gradient of the contrast is the gradient of the enumerated log-likelihood."""
 
+import copy
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.objective import contrast
+from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.samplers import CD, Exact, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
-from memcomp_lightning.types import NoState
+from memcomp_lightning.types import Configurations, NoState
 
 SIZES = [(7, 5), (5, 7)]
 REPLICAS = [(), (3,), (2, 3)]
@@ -107,3 +110,77 @@ def test_replicas_stay_independent():
     for a, b in zip(ours, other, strict=True):
         assert a[:2].equal(b[:2])
         assert not a[2].equal(b[2])
+
+
+def centred_loss(rbm, parameters, offsets, v):
+    """Mean negative log-likelihood of the RBM whose centred parameters are given, by enumeration."""
+    weight, b, c = parameters
+    mu, lam = offsets
+    plain = SimpleNamespace(
+        weight=weight,
+        b=b - (lam.unsqueeze(-2) @ weight).squeeze(-2),
+        c=c - (weight @ mu.unsqueeze(-1)).squeeze(-1),
+        n_visible=rbm.n_visible,
+        n_hidden=rbm.n_hidden,
+    )
+    return negative_log_likelihood(plain, v)
+
+
+@pytest.mark.parametrize("replicas", REPLICAS, ids=str)
+def test_centred_gradient_is_a_step_of_the_centred_parametrisation(replicas):
+    """A small step along it is the step that descent on the centred parameters makes, seen in W, b and c."""
+    rbm, v = small_rbm(7, 5, replicas=replicas).double(), data(small_rbm(7, 5, replicas=replicas), binary=True)
+    positive = positive_phase(rbm, v)
+    offsets = Centring().follow(None, positive)
+    torch.testing.assert_close(offsets.visible, v.mean(-2))
+    negative = Exact().sample(rbm, NoState(), positive, generator=rng.stream(0, "unused")).configurations
+    loss = contrast(rbm, positive, negative, offsets)
+    torch.testing.assert_close(loss, contrast(rbm, positive, negative))
+    ours = torch.autograd.grad(loss.sum(), [rbm.weight, rbm.b, rbm.c])
+    mu, lam = offsets
+    with torch.no_grad():
+        centred = [
+            rbm.weight.clone(),
+            rbm.b + (lam.unsqueeze(-2) @ rbm.weight).squeeze(-2),
+            rbm.c + (rbm.weight @ mu.unsqueeze(-1)).squeeze(-1),
+        ]
+    centred = [x.requires_grad_() for x in centred]
+    g_weight, g_b, g_c = torch.autograd.grad(centred_loss(rbm, centred, offsets, v).sum(), centred)
+    expected = [
+        g_weight,
+        g_b - (lam.unsqueeze(-2) @ g_weight).squeeze(-2),
+        g_c - (g_weight @ mu.unsqueeze(-1)).squeeze(-1),
+    ]
+    for a, e in zip(ours, expected, strict=True):
+        torch.testing.assert_close(a, e, rtol=0, atol=1e-12)
+
+
+def test_centred_gradient_does_not_care_which_state_is_called_one():
+    """Flipping visible unit 2 flips its weights' gradient and nothing else."""
+    rbm, v = small_rbm(7, 5).double(), data(small_rbm(7, 5), binary=True)
+
+    def gradient(model, images):
+        positive = positive_phase(model, images)
+        negative = Exact().sample(model, NoState(), positive, generator=rng.stream(0, "unused")).configurations
+        loss = contrast(model, positive, negative, Centring().follow(None, positive))
+        return torch.autograd.grad(loss, model.weight)[0]
+
+    flipped, other = copy.deepcopy(rbm), v.clone()
+    other[:, 2] = 1 - other[:, 2]
+    with torch.no_grad():
+        flipped.c += flipped.weight[:, 2]
+        flipped.weight[:, 2] *= -1
+        flipped.b[2] *= -1
+    expected = gradient(rbm, v)
+    expected[:, 2] *= -1
+    torch.testing.assert_close(gradient(flipped, other), expected, rtol=0, atol=1e-12)
+
+
+def test_offsets_follow_the_positive_phase():
+    old = Offsets(torch.zeros(2), torch.ones(3))
+    positive = Configurations(torch.tensor([[1.0, 0.0], [1.0, 1.0]]), torch.zeros(2, 3))
+    new = Centring(rate=0.25).follow(old, positive)
+    assert new.visible.tolist() == [0.25, 0.125]
+    assert new.hidden.tolist() == [0.75] * 3
+    with pytest.raises(SettingError, match="centring rate = 0"):
+        Centring(rate=0)

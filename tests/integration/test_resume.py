@@ -12,8 +12,10 @@ from running import launch
 
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [
-    "sampler=pcd",
-    "sampler.n_chains=11",
+    "sampler=mode_assisted_pcd",
+    "sampler.schedule.p_max=0.5",
+    "pretrain=centred",
+    "sampler.inner.n_chains=11",
     "pretrain.iterations=20",
     "pretrain.batch_size=300",
     "finetune.iterations=40",

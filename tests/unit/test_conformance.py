@@ -9,7 +9,16 @@ import torch
 from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, Qubo
-from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
+from memcomp_lightning.samplers import (
+    CD,
+    PCD,
+    Exact,
+    GroundState,
+    ModeAssisted,
+    ModeSchedule,
+    ParallelTempering,
+    Quench,
+)
 from memcomp_lightning.samplers.gibbs import sweep
 from memcomp_lightning.testing import check_sampler, check_solver
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -33,12 +42,19 @@ SOLVERS = {
     "brute force": BruteForce(),
     "brute force in chunks": BruteForce(chunk_size=13),
 }
+ALWAYS = ModeSchedule(n_updates=1, p_max=1.0, delay=-1e3)
+NEVER = ModeSchedule(n_updates=1, p_max=0.0)
 SAMPLERS = {
     "CD-1": CD(),
     "CD-3": CD(k=3),
     "CD-1 of means": CD(visible="mean", hidden="sample"),
     "PCD": PCD(),
     "PCD with its own chains": PCD(k=3, n_chains=23),
+    "PCD with chains for each image": PCD(chains_per_datum=3),
+    "parallel tempering": ParallelTempering(k=3, n_chains=7, n_temperatures=5),
+    "parallel tempering of two": ParallelTempering(k=2, n_chains=None, n_temperatures=2),
+    "always the mode": ModeAssisted(inner=PCD(), mode=GroundState(solver=BruteForce()), schedule=ALWAYS),
+    "never the mode": ModeAssisted(inner=PCD(), mode=GroundState(solver=BruteForce()), schedule=NEVER),
     "exact": Exact(),
     "quench": Quench(),
     "quench, one start an image": Quench(n_chains=None),

@@ -1,0 +1,132 @@
+"""Mode-assisted training: now and then the ground state takes the place of another sampler's negative phase."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.objective import shares
+from memcomp_lightning.samplers.base import NegativePhaseSampler
+from memcomp_lightning.samplers.tempering import TemperedModel
+from memcomp_lightning.types import Configurations, NegativePhase
+
+
+class SizedModel(TemperedModel, Protocol):
+    """A two-layer model with the energy of joint states and the sizes of both layers."""
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of hidden units."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ModeSchedule:
+    r"""Probability of the mode in update t of N: ``p_max \sigma(steepness t / N - delay)``.
+
+    Manukian, Pei, Bearden and Di Ventra 2020 (Commun. Phys. 3:105), with the values of its public codes: next to
+    none in the first quarter, half of ``p_max`` at 30 % of the training, all of it in the second half.
+
+    Attributes:
+        n_updates: N, updates of the training, >= 1; later ones keep the last probability.
+        p_max: Highest probability, in [0, 1].
+        steepness: Of the rise.
+        delay: Of the rise.
+    """
+
+    n_updates: int
+    p_max: float = 0.1
+    steepness: float = 20.0
+    delay: float = 6.0
+
+    def __post_init__(self) -> None:
+        require_count("n_updates", self.n_updates)
+        require(0 <= self.p_max <= 1, "p_max", self.p_max, "a number in [0, 1]")
+
+    def probability(self, n_done: int) -> float:
+        """Probability of the mode after so many updates.
+
+        >>> ModeSchedule(n_updates=100).probability(30)
+        0.05
+        """
+        share = min(n_done / self.n_updates, 1.0)
+        return self.p_max * (1 + math.tanh((self.steepness * share - self.delay) / 2)) / 2
+
+
+class ModeAssistedState(NamedTuple):
+    """States of both samplers, and how many updates were done, a scalar."""
+
+    n_done: Tensor
+    inner: Any
+    mode: Any
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ModeAssisted:
+    r"""With the probability of ``schedule`` an update follows ``g (E(data) - E(x*))``, otherwise ``inner``.
+
+    x* is the ground state that ``mode`` finds, and
+
+    .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
+
+    with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state in units
+    of the largest that couplings of one can give. The scaled update is written as a negative phase: x* has the
+    weight g, the positive phase keeps 1 - g. One coin serves all replicas, so that a ground state is computed only
+    when it is used; an update in chunks tosses it for each chunk.
+
+    Attributes:
+        inner: Sampler of the other updates.
+        mode: Sampler of the ground state.
+        schedule: When.
+    """
+
+    uses_data: ClassVar[bool] = True
+    shared: ClassVar[bool] = False
+
+    inner: NegativePhaseSampler[Any, Any]
+    mode: NegativePhaseSampler[Any, Any]
+    schedule: ModeSchedule
+
+    def init(self, model: SizedModel, n_chains: int, *, generator: Generator) -> ModeAssistedState:
+        """Start both samplers."""
+        return ModeAssistedState(
+            torch.zeros((), dtype=torch.long),
+            self.inner.init(model, n_chains, generator=generator),
+            self.mode.init(model, n_chains, generator=generator),
+        )
+
+    @torch.no_grad()
+    def sample(
+        self, model: SizedModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
+    ) -> NegativePhase[ModeAssistedState]:
+        """Toss the coin, and return one negative phase or the other, with its ``info``."""
+        n_done = int(state.n_done)
+        state = state._replace(n_done=state.n_done + 1)
+        probability = self.schedule.probability(n_done)
+        if float(rng.uniform((), generator=generator)) >= probability:
+            found = self.inner.sample(model, state.inner, positive, generator=generator)
+            return found._replace(state=state._replace(inner=found.state))
+        found = self.mode.sample(model, state.mode, positive, generator=generator)
+        scale = mode_scale(model, found.configurations)
+        mixed = _mixture(found.configurations, positive, scale)
+        info = {**found.info, "mode_scale": scale}
+        return NegativePhase(mixed, state._replace(mode=found.state), info)
+
+
+def mode_scale(model: SizedModel, mode: Configurations) -> Tensor:
+    """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1]; the lowest energy counts."""
+    half_v, half_h = (torch.full_like(x[..., :1, :], 0.5) for x in (mode.v, mode.h))
+    depth = model.energy(half_v, half_h).squeeze(-1) - model.energy(mode.v, mode.h).amin(-1)
+    return (depth / (4 * (model.n_visible + 1) * (model.n_hidden + 1))).clamp(0.0, 1.0)
+
+
+def _mixture(mode: Configurations, positive: Configurations, scale: Tensor) -> Configurations:
+    """``mode`` with the weight ``scale`` and ``positive`` with the rest."""
+    share = scale.unsqueeze(-1)
+    weights = [share * shares(mode), (1 - share) * shares(positive)]
+    v, h = (torch.cat(pair, dim=-2) for pair in ((mode.v, positive.v), (mode.h, positive.h)))
+    return Configurations(v, h, torch.cat(weights, dim=-1))

@@ -1,0 +1,165 @@
+"""Parallel tempering: chains at several temperatures that exchange their states."""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible
+from memcomp_lightning.types import Configurations, NegativePhase
+
+
+class TemperedModel(TwoLayerModel, Protocol):
+    """A two-layer model with the energy of joint states."""
+
+    def energy(self, v: Tensor, h: Tensor) -> Tensor:
+        """E(v, h)."""
+        ...
+
+
+class Ladder(NamedTuple):
+    """Chains at all temperatures, from the coldest (beta = 1) to the hottest.
+
+    Attributes:
+        v: Visible states, ``(*replicas, n_temperatures, n_chains, n_visible)``.
+        gap: Difference of inverse temperature between neighbours, ``(*replicas, n_temperatures - 1)``.
+        swap_rate: Running mean of the accepted share of exchanges, ``(*replicas, n_temperatures - 1)``.
+        last_end: The end of the ladder that a state was at last: 1 the coldest, -1 the hottest, 0 none yet;
+            ``(*replicas, n_temperatures, n_chains)``.
+        round_trips: Journeys from the coldest to the hottest and back, of all states, ``(*replicas,)``.
+        n_rounds: Rounds of exchanges so far, a scalar.
+    """
+
+    v: Tensor
+    gap: Tensor
+    swap_rate: Tensor
+    last_end: Tensor
+    round_trips: Tensor
+    n_rounds: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ParallelTempering:
+    """Persistent chains at inverse temperatures 1 = beta_0 > ... > beta_{T-1} >= 0; the coldest are returned.
+
+    After each sweep neighbours exchange their states with probability
+    ``min(1, exp((beta_i - beta_j) (E_i - E_j)))``, even and odd pairs in turn, which leaves the product of all
+    ``exp(-beta E) / Z(beta)`` invariant (Desjardins et al. 2010; Cho et al. 2010). The gaps between the
+    temperatures follow the accepted share of exchanges towards ``target_swap_rate``; the hottest temperature is
+    where that leads, at most infinite.
+
+    Attributes:
+        k: Sweeps an update, >= 1.
+        n_chains: Ladders a replica, >= 1; None takes as many as there are images in the batch.
+        n_temperatures: Steps of a ladder, >= 2.
+        target_swap_rate: Accepted share of exchanges that the gaps are led to, in (0, 1).
+        adaptation: How fast: change of the log of a gap for an accepted share off by one, >= 0; 0 keeps the gaps
+            equal.
+    """
+
+    uses_data: ClassVar[bool] = False
+    shared: ClassVar[bool] = False
+
+    k: int = 1
+    n_chains: int | None = 100
+    n_temperatures: int = 10
+    target_swap_rate: float = 0.5
+    adaptation: float = 0.1
+
+    def __post_init__(self) -> None:
+        require_count("k", self.k)
+        if self.n_chains is not None:
+            require_count("n_chains", self.n_chains)
+        require_count("n_temperatures", self.n_temperatures, minimum=2)
+        require(
+            0 < self.target_swap_rate < 1, "target_swap_rate", self.target_swap_rate, "a number between 0 and 1"
+        )
+        require(self.adaptation >= 0, "adaptation", self.adaptation, "a number >= 0")
+
+    def init(self, model: TemperedModel, n_chains: int, *, generator: Generator) -> Ladder:
+        """Start all chains at random states and the gaps equal."""
+        n, n_temperatures, replicas = self.n_chains or n_chains, self.n_temperatures, model.replicas
+        v = random_visible(model, n_temperatures * n, generator=generator)
+        gap = torch.full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1)).to(v)
+        return Ladder(
+            v=v.unflatten(-2, (n_temperatures, n)),
+            gap=gap,
+            swap_rate=torch.full_like(gap, self.target_swap_rate),
+            last_end=torch.zeros((*replicas, n_temperatures, n), device=v.device),
+            round_trips=torch.zeros(replicas, device=v.device),
+            n_rounds=torch.zeros((), dtype=torch.long),
+        )
+
+    @torch.no_grad()
+    def sample(
+        self, model: TemperedModel, state: Ladder, positive: Configurations, *, generator: Generator
+    ) -> NegativePhase[Ladder]:
+        """Return the coldest configuration of each ladder."""
+        for _ in range(self.k):
+            state = self._round(model, state, generator)
+        v = state.v[..., 0, :, :].clone()
+        info = {
+            "swap_rate": state.swap_rate.mean(-1),
+            "swap_rate_lowest": state.swap_rate.amin(-1),
+            "beta_hottest": betas(state.gap)[..., -1],
+            "round_trips": state.round_trips.clone(),
+        }
+        return NegativePhase(Configurations(v, model.hidden_mean(v)), state, info)
+
+    def _round(self, model: TemperedModel, state: Ladder, generator: Generator) -> Ladder:
+        """A sweep at every temperature, and exchanges of every second pair of neighbours."""
+        shape, beta = state.v.shape, betas(state.gap)
+        n_chains = shape[-2]
+        every = beta.repeat_interleave(n_chains, dim=-1).unsqueeze(-1)
+        h = rng.bernoulli(model.hidden_mean(state.v.flatten(-3, -2), beta=every), generator=generator)
+        v = rng.bernoulli(model.visible_mean(h, beta=every), generator=generator)
+        energy = model.energy(v, h).unflatten(-1, (-1, n_chains))
+        first = int(state.n_rounds) % 2
+        cold, hot = slice(first, shape[-3] - 1, 2), slice(first + 1, None, 2)
+        if energy[..., cold, :].shape[-2] == 0:  # two temperatures have no odd pair
+            return state._replace(v=v.view(shape), n_rounds=state.n_rounds + 1)
+        log_ratio = (beta[..., cold] - beta[..., hot]).unsqueeze(-1) * (energy[..., cold, :] - energy[..., hot, :])
+        draw = rng.uniform(log_ratio.shape, generator=generator, like=log_ratio)
+        swaps = draw < log_ratio.exp()
+        v, last_end = _exchanged(v.view(shape), swaps.unsqueeze(-1), cold, hot), state.last_end
+        last_end = _exchanged(last_end.unsqueeze(-1), swaps.unsqueeze(-1), cold, hot).squeeze(-1)
+        home = last_end[..., 0, :] == -1
+        last_end[..., 0, :], last_end[..., -1, :] = 1.0, _down(last_end[..., -1, :])
+        return self._adapted(state, swaps.to(v.dtype).mean(-1), cold)._replace(
+            v=v,
+            last_end=last_end,
+            round_trips=state.round_trips + home.sum(-1),
+            n_rounds=state.n_rounds + 1,
+        )
+
+    def _adapted(self, state: Ladder, accepted: Tensor, pairs: slice) -> Ladder:
+        """Wider gaps where more is accepted than asked for, narrower ones where less is."""
+        swap_rate, gap = state.swap_rate.clone(), state.gap.clone()
+        swap_rate[..., pairs] = swap_rate[..., pairs].lerp(accepted, 0.1)
+        change = self.adaptation * (accepted - self.target_swap_rate)
+        gap[..., pairs] = (gap[..., pairs] * change.exp()).clamp(1e-6, 1.0)
+        return state._replace(swap_rate=swap_rate, gap=gap)
+
+
+def betas(gap: Tensor) -> Tensor:
+    """Inverse temperatures of a ladder, ``(*replicas, n_temperatures)``: 1 less the gaps, not below 0."""
+    below = (1 - gap.cumsum(-1)).clamp_min(0.0)
+    return torch.cat((torch.ones_like(below[..., :1]), below), dim=-1)
+
+
+def _exchanged(x: Tensor, swaps: Tensor, cold: slice, hot: slice) -> Tensor:
+    """``(*replicas, n_temperatures, n_chains, n)`` with some neighbours exchanged."""
+    x = x.clone()
+    x[..., cold, :, :], x[..., hot, :, :] = (
+        torch.where(swaps, x[..., hot, :, :], x[..., cold, :, :]),
+        torch.where(swaps, x[..., cold, :, :], x[..., hot, :, :]),
+    )
+    return x
+
+
+def _down(last_end: Tensor) -> Tensor:
+    """At the hottest temperature: states that came from the coldest one are on their way back."""
+    return torch.where(last_end == 0, last_end, -1.0)
