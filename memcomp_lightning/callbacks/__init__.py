@@ -5,6 +5,7 @@ from memcomp_lightning.callbacks.classification import ClassificationMetrics
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
+from memcomp_lightning.callbacks.learning_rate_decay import LearningRateDecay
 from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
@@ -17,6 +18,7 @@ __all__ = [
     "ClassificationMetrics",
     "FreeEnergyGap",
     "HyperParameters",
+    "LearningRateDecay",
     "ModelSamples",
     "MomentumSchedule",
     "NegativePhaseEnergies",

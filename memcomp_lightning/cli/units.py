@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import MomentumSchedule
+from memcomp_lightning.callbacks import LearningRateDecay, MomentumSchedule
 from memcomp_lightning.cli.build import Plan, Stage, build
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, DBNPretraining, DivergedError, evaluate
@@ -49,7 +49,9 @@ class Member:
         """What networks must share to be fine-tuned as one program."""
         config = self.config
         shared = {name: config[name] for name in ("data", "finetune", "trainer")}
-        shared["momentum"] = config["callbacks"]["finetune"].get("momentum_schedule")
+        shared["schedules"] = [
+            config["callbacks"]["finetune"].get(name) for name in ("momentum_schedule", "learning_rate_decay")
+        ]
         shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)
 
@@ -189,9 +191,10 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
 
 
 def rates_of(stage: Stage) -> Rates:
-    """Optimiser and momentum of a stage."""
-    schedules = [callback for callback in stage.callbacks if isinstance(callback, MomentumSchedule)]
-    return Rates(stage.module.make_optimizer, schedules[0].momentum if schedules else None)
+    """Optimiser, momentum and learning rate of a stage."""
+    momentum = [callback.momentum for callback in stage.callbacks if isinstance(callback, MomentumSchedule)]
+    decay = [callback.factor for callback in stage.callbacks if isinstance(callback, LearningRateDecay)]
+    return Rates(stage.module.make_optimizer, *(found[0] if found else None for found in (momentum, decay)))
 
 
 def tuning(plan: Plan) -> Stage:

@@ -19,6 +19,7 @@ class ShiftingBars:
     Args:
         n_pixels: Length of the pattern, >= 2.
         bar_length: Number of ones, 1 to ``n_pixels - 1``.
+        inverted: Whether the bar is of zeros among ones.
         copies: How often the training set holds each pattern, >= 1; the test set holds it once.
 
     >>> ShiftingBars(n_pixels=3, bar_length=2).load().train_v.tolist()
@@ -27,6 +28,7 @@ class ShiftingBars:
 
     n_pixels: int = 9
     bar_length: int = 5
+    inverted: bool = False
     copies: int = 1
 
     def __post_init__(self) -> None:
@@ -40,9 +42,12 @@ class ShiftingBars:
         """Return the patterns."""
         pixel = torch.arange(self.n_pixels)
         offset = (pixel - pixel[:, None]) % self.n_pixels
-        v = (offset < self.bar_length).float()
-        layout = PixelLayout(height=1, width=self.n_pixels)
-        return _same_set(v, pixel, self.n_pixels, layout, "shifting_bars", self.copies)
+        v = ((offset < self.bar_length) ^ self.inverted).float()
+        layout, name = (
+            PixelLayout(height=1, width=self.n_pixels),
+            "inverted_bars" if self.inverted else "shifting_bars",
+        )
+        return _same_set(v, pixel, self.n_pixels, layout, name, self.copies)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

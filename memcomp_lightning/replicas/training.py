@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Generator, nn
 from torch.optim import Optimizer
 
 from memcomp_lightning import rng
+from memcomp_lightning.callbacks.learning_rate_decay import set_learning_rate
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
@@ -30,16 +31,20 @@ class Rates(NamedTuple):
     Attributes:
         optimizer: Builds an optimiser for some parameters; element-wise, so that replicas stay independent.
         momentum: Momentum of a pass, by its number from 0 (of the layer, in pretraining); None leaves it.
+        learning_rate: Share of the optimiser's learning rate in a pass; None leaves it.
     """
 
     optimizer: OptimizerFactory
     momentum: Callable[[int], float] | None = None
+    learning_rate: Callable[[int], float] | None = None
 
     def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
-        """Set the momentum of a pass."""
+        """Set momentum and learning rate of a pass."""
         if self.momentum is not None:
             for group in optimizer.param_groups:
                 group["momentum"] = self.momentum(iteration)
+        if self.learning_rate is not None:
+            set_learning_rate(optimizer, self.learning_rate(iteration))
 
 
 def pretrain(
@@ -66,31 +71,56 @@ def pretrain(
     Raises:
         DivergedError: A parameter left the finite numbers.
     """
-    require_count("iterations", iterations, minimum=0)
+    settings: dict[str, Any] = {"iterations": iterations, "rates": rates, "centring": centring}
     generator = rng.stream(seed, "negative_phase")
-    for layer, rbm in enumerate(dbn):
-        optimizer, state = rates.optimizer(rbm.parameters()), None
-        offsets: Offsets | None = None
-        for iteration in range(iterations):
-            rates.begin_pass(optimizer, iteration)
-            batches.set_epoch(layer * iterations + iteration)
-            negative: NegativePhase[Any] | None = None
-            for batch in batches:
-                with torch.no_grad():
-                    positive = positive_phase(rbm, dbn.visible_of(layer, batch.v))
-                if state is None:
-                    state = sampler.init(rbm, positive.v.shape[-2], generator=generator)
-                if negative is None and centring is not None:
-                    offsets = centring.follow(offsets, positive)
-                if negative is None or sampler.uses_data:
-                    negative = sampler.sample(rbm, state, positive, generator=generator)
-                    state = negative.state
-                (batch.share * contrast(rbm, positive, negative.configurations, offsets).sum()).backward()
-                if batch.closes_step:
-                    optimizer.step()
-                    optimizer.zero_grad()
-                    negative = None
-        _check_finite(rbm, f"pretraining, layer {layer + 1}")
+    for layer in range(len(dbn)):
+        for _ in pretrain_layer(dbn, layer, batches, sampler, generator=generator, **settings):
+            pass
+
+
+def pretrain_layer(
+    dbn: DBN,
+    layer: int,
+    batches: Batches,
+    sampler: NegativePhaseSampler[RBM, Any],
+    *,
+    iterations: int,
+    rates: Rates,
+    centring: Centring | None = None,
+    generator: Generator,
+) -> Iterator[int]:
+    """Train one RBM of a DBN in place; yield the number of each pass once it is done.
+
+    Arguments are those of :func:`pretrain`, with the index of the layer and the stream of the negative phase.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations, minimum=0)
+    rbm = dbn[layer]
+    optimizer, state = rates.optimizer(rbm.parameters()), None
+    offsets: Offsets | None = None
+    for iteration in range(iterations):
+        rates.begin_pass(optimizer, iteration)
+        batches.set_epoch(layer * iterations + iteration)
+        negative: NegativePhase[Any] | None = None
+        for batch in batches:
+            with torch.no_grad():
+                positive = positive_phase(rbm, dbn.visible_of(layer, batch.v))
+            if state is None:
+                state = sampler.init(rbm, positive.v.shape[-2], generator=generator)
+            if negative is None and centring is not None:
+                offsets = centring.follow(offsets, positive)
+            if negative is None or sampler.uses_data:
+                negative = sampler.sample(rbm, state, positive, generator=generator)
+                state = negative.state
+            (batch.share * contrast(rbm, positive, negative.configurations, offsets).sum()).backward()
+            if batch.closes_step:
+                optimizer.step()
+                optimizer.zero_grad()
+                negative = None
+        yield iteration + 1
+    _check_finite(rbm, f"pretraining, layer {layer + 1}")
 
 
 def finetune(

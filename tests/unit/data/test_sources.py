@@ -81,6 +81,9 @@ def test_shifting_bars():
         assert data.train_v[shift].equal(data.train_v[0].roll(shift))
     assert data.train_v[0].tolist() == [1] * 5 + [0] * 4
     assert data.test_v.equal(data.train_v)
+    inverted = ShiftingBars(inverted=True).load()
+    assert inverted.train_v.equal(1 - data.train_v)
+    assert inverted.name == "inverted_bars"
 
 
 def test_copies_repeat_the_training_set():
