@@ -26,7 +26,7 @@ def check_shapes(function):
     return beartype(function)
 
 
-HOOKED = [f"memcomp_lightning.{name}" for name in ("models", "objective", "qubo", "dmm", "samplers")]
+HOOKED = [f"memcomp_lightning.{name}" for name in ("models", "objective", "qubo", "dmm", "samplers", "likelihood")]
 
 # pytest forgets a module called conftest; the hook looks its checker up by name, at each failure.
 sys.modules["memcomp_lightning_tests"] = sys.modules[__name__]
@@ -38,14 +38,16 @@ torch.set_num_threads(1)
 
 
 def pytest_sessionstart(session):
-    """Compile the DMM kernels before there are several workers, each of which would; later runs load them."""
+    """Compile the kernels before there are several workers, each of which would; later runs load them."""
     options = session.config.option
     if getattr(options, "numprocesses", None) and not options.collectonly:
         from memcomp_lightning import rng
         from memcomp_lightning.dmm import DmmSolver
+        from memcomp_lightning.likelihood import log_partition_function
         from memcomp_lightning.qubo import Qubo, from_model
         from memcomp_lightning.testing.conformance import small_rbm
 
+        log_partition_function(small_rbm())
         for problem in (from_model(small_rbm()), Qubo.from_matrix(torch.ones(2, 2))):
             DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=rng.stream(0, "compile"))
 

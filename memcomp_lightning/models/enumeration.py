@@ -1,7 +1,7 @@
 """All states of a few binary units."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -17,6 +17,10 @@ def binary_states(n: int, *, start: int = 0, stop: int | None = None, like: Tens
     >>> binary_states(2, like=torch.zeros(())).tolist()
     [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]
     """
-    numbers = torch.arange(start, 2**n if stop is None else stop, device=like.device)
+    return bits(torch.arange(start, 2**n if stop is None else stop, device=like.device), n, like=like)
+
+
+def bits(numbers: Int[Tensor, "*axes"], n: int, *, like: Tensor) -> Float[Tensor, "*axes n"]:
+    """Return the n lowest bits of each number, the highest of them first, in the dtype of ``like``."""
     shifts = torch.arange(n - 1, -1, -1, device=like.device)
-    return ((numbers[:, None] >> shifts) & 1).to(like.dtype)
+    return ((numbers.unsqueeze(-1) >> shifts) & 1).to(like.dtype)

@@ -1,0 +1,17 @@
+"""How likely data are under an RBM: log Z by enumeration or annealing, and what follows from it."""
+
+from memcomp_lightning.likelihood.exact import (
+    exact_samples,
+    kl_divergence,
+    log_likelihood,
+    log_partition_function,
+    log_pseudo_likelihood,
+)
+
+__all__ = [
+    "exact_samples",
+    "kl_divergence",
+    "log_likelihood",
+    "log_partition_function",
+    "log_pseudo_likelihood",
+]

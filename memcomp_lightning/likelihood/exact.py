@@ -1,0 +1,213 @@
+"""Exact likelihoods of an RBM one of whose layers can be enumerated, and what needs no partition function."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
+from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
+from memcomp_lightning.models.enumeration import binary_states, bits
+from memcomp_lightning.models.rbm import RBM
+
+_NUMBERS = 2**23
+"""float64 numbers held at a time."""
+
+
+@torch.no_grad()
+def log_partition_function(
+    model: RBM, *, max_units: int = 25, progress: bool = False
+) -> Float[Tensor, "*replicas"]:
+    r"""Return log Z, by enumerating the smaller layer.
+
+    .. math:: Z = \sum_s exp(g.s) \prod_i (1 + exp(W s + c)_i)
+
+    over the states s of the smaller layer, with bias g, and the units i of the other one. Time grows as
+    2^n_smaller n_other, about 5e9 such pairs a second and CPU thread.
+
+    Args:
+        model: The RBM, of any dtype; the sum is done in float64.
+        max_units: Largest smaller layer, 1 to 32.
+        progress: Log an estimate of the time and show a bar.
+
+    Returns:
+        ``(*replicas,)`` float64.
+
+    Raises:
+        SettingError: The smaller layer has more than ``max_units`` units, or a parameter is not finite.
+
+    >>> log_partition_function(RBM(n_visible=3, n_hidden=2)).shape
+    torch.Size([])
+    """
+    layers = enumerable(model, max_units)
+    return prefix_log_weights(layers, progress=progress).logsumexp(-1).reshape(model.replicas)
+
+
+@torch.no_grad()
+def exact_samples(
+    model: RBM, n: int, *, generator: Generator, max_units: int = 25
+) -> Float[Tensor, "*replicas n n_visible"]:
+    """Draw independent visible states from the model, by enumerating the smaller layer.
+
+    Args:
+        model: The RBM.
+        n: Number of samples a replica, >= 1.
+        generator: Random stream.
+        max_units: Largest smaller layer, 1 to 32.
+
+    Returns:
+        States in {0, 1}, in the model's dtype.
+
+    Raises:
+        SettingError: As :func:`log_partition_function`.
+    """
+    require_count("n", n)
+    layers = enumerable(model, max_units)
+    n_second = min(N_SECOND, layers.n_enumerated)
+    of_prefixes = prefix_log_weights(layers, n_second=n_second).unsqueeze(-2)
+    prefix = _draw(of_prefixes.expand(-1, 1, -1), n, generator=generator).squeeze(-2)
+    second = binary_states(n_second, like=layers.weight)
+    rows = max(1, _NUMBERS // (len(layers.weight) * layers.n_other * len(second)))
+    rest = []
+    for part in prefix.split(rows, dim=-1):
+        log_weight = log_weights(layers, bits(part, layers.n_enumerated - n_second, like=second), second)
+        rest.append(_draw(log_weight, 1, generator=generator))
+    number = prefix * len(second) + torch.cat(rest, dim=1).squeeze(-1)
+    states = bits(number, layers.n_enumerated, like=model.b)
+    states = states.reshape(*model.replicas, n, layers.n_enumerated)
+    return rng.bernoulli(model.visible_mean(states), generator=generator) if layers.hidden_first else states
+
+
+def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
+    """Draw n indices of the last axis for each distribution, by inversion: ``(..., n)`` int64."""
+    cumulative = torch.softmax(log_weight, dim=-1).cumsum(-1)
+    cumulative = cumulative / cumulative[..., -1:]
+    u = rng.uniform((*cumulative.shape[:-1], n), generator=generator, like=cumulative)
+    # To the right of equal values: a state of probability zero is never drawn.
+    return torch.searchsorted(cumulative, u, right=True)
+
+
+@torch.no_grad()
+def log_likelihood(
+    model: RBM, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
+) -> Float[Tensor, "*replicas n"]:
+    """Return log p(v) = -F(v) - log Z of each image.
+
+    Args:
+        model: The RBM.
+        v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
+        log_z: Log of the partition function, exact or estimated, ``(*replicas,)``.
+
+    Returns:
+        ``(*replicas, n)`` float64, in nats.
+
+    Raises:
+        SettingError: v is not binary or has the wrong shape.
+    """
+    v = _binary(model, v)
+    weight, b, c = _double(model)
+
+    def minus_free_energy(rows: Tensor) -> Tensor:
+        field = rows @ weight.mT + c.unsqueeze(-2)
+        return softplus(field).sum(-1) + (rows @ b.unsqueeze(-1)).squeeze(-1)
+
+    return _in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
+
+
+@torch.no_grad()
+def kl_divergence(
+    model: RBM, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"] | None = None
+) -> Float[Tensor, "*replicas"]:
+    r"""Return the divergence of the model from the empirical distribution of the rows of v.
+
+    .. math:: KL(p_v || p) = \sum_x p_v(x) (log p_v(x) - log p(x))
+
+    over the different rows x, p_v(x) being the share of the rows that are x. States without a row add nothing.
+
+    Args:
+        model: The RBM.
+        v: Images in {0, 1}, as for :func:`log_likelihood`.
+        log_z: Log of the partition function; None enumerates (:func:`log_partition_function`).
+
+    Returns:
+        ``(*replicas,)`` float64, in nats; >= 0 where log Z is exact.
+
+    Raises:
+        SettingError: v is not binary or has the wrong shape; the smaller layer is too large to enumerate.
+    """
+    require_count("number of rows of v", _binary(model, v).shape[-2])
+    log_p = log_likelihood(model, v, log_partition_function(model) if log_z is None else log_z)
+    n = v.shape[-2]
+    log_shares = [_log_shares(rows) for rows in v.reshape(-1, n, v.shape[-1])]
+    return (torch.stack(log_shares).reshape(*v.shape[:-2], n) - log_p).mean(-1)
+
+
+def _log_shares(rows: Tensor) -> Tensor:
+    """Log of the share of the rows that equal each row, ``(n,)`` float64."""
+    _, at, counts = torch.unique(rows, dim=0, return_inverse=True, return_counts=True)
+    log_shares: Tensor = (counts[at].double() / len(rows)).log()
+    return log_shares
+
+
+@torch.no_grad()
+def log_pseudo_likelihood(
+    model: RBM, v: Float[Tensor, "*axes n n_visible"]
+) -> Float[Tensor, "*replicas n n_visible"]:
+    r"""Return log p(v_j | all other v) of each unit j of each image; needs no log Z.
+
+    .. math:: log p(v_j | v_{-j}) = -softplus(F(v) - F(v'))
+
+    where v' is v with unit j flipped, whose hidden field differs from that of v by one column of W. (Besag 1975.)
+
+    Args:
+        model: The RBM.
+        v: Images in {0, 1}, as for :func:`log_likelihood`.
+
+    Returns:
+        ``(*replicas, n, n_visible)`` float64; the sum over the last axis is the log pseudo-likelihood of an image.
+
+    Raises:
+        SettingError: v is not binary or has the wrong shape.
+    """
+    v = _binary(model, v)
+    weight, b, c = _double(model)
+
+    def of_rows(rows: Tensor) -> Tensor:
+        field = rows @ weight.mT + c.unsqueeze(-2)
+        change = 1 - 2 * rows
+        flipped = change.unsqueeze(-1) * weight.mT.unsqueeze(-3) + field.unsqueeze(-2)
+        gain = change * b.unsqueeze(-2) + softplus(flipped).sum(-1) - softplus(field).sum(-1, keepdim=True)
+        return -softplus(gain)
+
+    return _in_chunks(of_rows, v, model.n_visible * model.n_hidden)
+
+
+def _binary(model: RBM, v: Tensor) -> Tensor:
+    """Images with the model's replica axes."""
+    replicas = model.replicas
+    fits = v.ndim >= 2 and v.shape[-1] == model.n_visible and v.shape[:-2] in ((), replicas)
+    allowed = f"(n, {model.n_visible}), or with the replica axes {replicas} in front of it"
+    require(fits, "shape of v", tuple(v.shape), allowed)
+    other = v[(v != 0) & (v != 1)]
+    require(
+        not len(other),
+        "v",
+        float(other[0]) if len(other) else 0.0,
+        "values in {0, 1}",
+        "Grey values have no likelihood under a Bernoulli RBM: binarise the images, say v > 0.5.",
+    )
+    return v.expand(*replicas, *v.shape[-2:])
+
+
+def _double(model: RBM) -> tuple[Tensor, Tensor, Tensor]:
+    return model.weight.double(), model.b.double(), model.c.double()
+
+
+def _in_chunks(function: Callable[[Tensor], Tensor], v: Tensor, numbers_a_row: int) -> Tensor:
+    """Apply a function of rows, in float64, to so many rows at a time that about ``_NUMBERS`` numbers are held."""
+    n_replicas = max(1, v[..., :1, :1].numel())
+    rows = max(1, _NUMBERS // (n_replicas * numbers_a_row))
+    return torch.cat([function(part.double()) for part in v.split(rows, dim=-2)], dim=len(v.shape) - 2)
