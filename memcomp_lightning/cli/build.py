@@ -56,7 +56,7 @@ class Plan:
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
 _GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks")
 _SETTINGS = {
-    "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure"),
+    "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": (*_STAGE_SETTINGS, "centring"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
-from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, tuning
+from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
 from memcomp_lightning.cli.workers import runner
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.files import write_text
@@ -28,7 +28,7 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
     records = Records(folder)
     write_text(folder / "figure.json", json.dumps(_shown(config, overrides), indent=1) + "\n")
     composed = _curves(config, overrides)
-    with runner(config) as run:
+    with runner(config.figure.workers, config.trainer.accelerator, run_unit) as run:
         for choosing in (True, False):
             units = plan_units(config, composed, records, choosing=choosing)
             with tqdm(total=sum(unit.n_updates for unit in units), unit="update", unit_scale=True) as bar:
@@ -145,14 +145,18 @@ def composed_for(overrides: tuple[str, ...]) -> DictConfig:
 
     Settings that the curve does not have are left out: ``solver.max_steps`` where its solver is descent.
     """
-    own = [o for o in overrides if not o.lstrip("+~").startswith(("hydra.", "figure.", "figure/"))]
+    own = [o for o in overrides if not o.lstrip("+~").startswith(_OF_MANY_RUNS)]
     try:
         composed = compose("config", own)
     except ConfigCompositionException:
         bare = compose("config", [o for o in own if "." not in o.partition("=")[0]])
         composed = compose("config", [o for o in own if _applies(o.partition("=")[0], bare)])
-    composed.figure = None
+    composed.figure = composed.worth = None
     return composed
+
+
+_OF_MANY_RUNS = ("hydra.", "figure.", "figure/", "worth.", "worth/")
+"""Overrides that say nothing of a single run."""
 
 
 def _applies(name: str, config: DictConfig) -> bool:

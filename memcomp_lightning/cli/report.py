@@ -1,6 +1,7 @@
 """``memcomp-report``: figures, tables and verdicts from run folders of ``experiment=figure4`` and the like."""
 
 import argparse
+import csv
 import io
 import json
 from collections.abc import Sequence
@@ -14,8 +15,9 @@ from memcomp_lightning.cli.errors import UserError, refuse
 from memcomp_lightning.cli.table import aligned, short_path
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import write_text, written_whole
-from memcomp_lightning.plotting import plot_against_iterations, plot_against_passes, plot_controls
-from memcomp_lightning.report import Section, markdown, page, read_results, verdicts
+from memcomp_lightning.plotting import plot_against_iterations, plot_against_passes, plot_controls, plot_worth
+from memcomp_lightning.report import Section, Verdict, markdown, page, read_results, verdicts
+from memcomp_lightning.report.worth import WORTH_RULE, read_worth, worth_table, worth_verdicts
 
 COMMAND = "memcomp-report"
 
@@ -30,6 +32,8 @@ def report(folder: Path) -> Section:
     if picture.exists():
         notes = json.loads((folder / "figure2.json").read_text(encoding="utf-8"))
         return Section(notes["title"], [("Fig. 2", picture.read_bytes())], [], notes["notes"])
+    if (folder / "worth.json").exists():
+        return _report_worth(folder)
     try:
         results = read_results(folder)
     except FileNotFoundError as error:
@@ -48,6 +52,23 @@ def report(folder: Path) -> Section:
     return Section(f"{name}: {results.plan.data}, {results.plan.title}", pictures, judged, notes)
 
 
+def _report_worth(folder: Path) -> Section:
+    """The same of a comparison of samplers."""
+    worth = read_worth(folder)
+    if not worth.data_sets:
+        raise UserError(f"{folder} has no courses yet: go on with memcomp-train resume={folder}")
+    table = worth_table(worth)
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(table)
+    write_text(folder / "sampler_worth.csv", buffer.getvalue())
+    judged = worth_verdicts(worth)
+    write_text(folder / "verdicts.md", markdown(judged))
+    figures = {name: plot_worth(worth, name) for name in worth.data_sets}
+    pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
+    notes = [*_origin(folder), WORTH_RULE, "Numbers: sampler_worth.csv"]
+    return Section(worth.plan["title"], pictures, judged, notes)
+
+
 def save(folder: Path, name: str, figure: Figure) -> bytes:
     """Write a figure as PNG and SVG and to TensorBoard; return the PNG."""
     for suffix in ("svg", "png"):
@@ -61,12 +82,12 @@ def save(folder: Path, name: str, figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def verdict_table(folder: Path) -> str:
-    """The verdicts of a folder, for the screen."""
-    rows = [["claim", "measured", "paired difference", "verdict"]]
-    for claim, measured, test, verdict, controls in verdicts(read_results(folder)):
+def verdict_table(judged: Sequence[Verdict]) -> str:
+    """Verdicts for the screen."""
+    rows = [["claim", "measured", "difference", "verdict"]]
+    for claim, measured, test, verdict, controls in judged:
         rows.append([claim, measured, test, verdict + (f" ({len(controls)})" if controls else "")])
-    return aligned(rows) if len(rows) > 1 else ""
+    return aligned(rows)
 
 
 def _origin(folder: Path) -> list[str]:
@@ -92,9 +113,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_text(output, page(sections))
     except (UserError, SettingError) as error:
         refuse(COMMAND, error)
-    for folder, section in zip(given.folders, sections, strict=True):
+    for section in sections:
         if section.verdicts:
-            print(f"\n{section.title}\n{verdict_table(folder)}")
+            print(f"\n{section.title}\n{verdict_table(section.verdicts)}")
     print(f"\nReport:  {short_path(output.absolute())}")
 
 

@@ -15,7 +15,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory
+from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory, worth
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
@@ -55,6 +55,9 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
             check = trajectory.prepare if "curves" not in part.figure else figures.check
             check(part, own)
         return
+    if config.worth is not None:
+        worth.check(config, overrides)
+        return
     values = tried_values(config)
     n_passes = config.finetune.iterations
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
@@ -68,8 +71,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
-    if config.figure is not None:
-        _figure(config, folder, overrides)
+    if config.figure is not None or config.worth is not None:
+        _many(config, folder, overrides)
         return
     if _is_first_process():
         folder.open(config, overrides)
@@ -86,11 +89,15 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
         print(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}", flush=True)
 
 
-def _figure(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
-    """Train what a figure needs, and write the report."""
+def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
+    """Train what a figure or a comparison needs, and write the report."""
     folder.open(config, overrides)
     folder.check_source()
     try:
+        if config.worth is not None:
+            worth.train_worth(config, overrides, folder.path)
+            report.main([str(folder.path)])
+            return
         trained = []
         for name, (part, own) in figures.parts(config, overrides).items():
             trained.append(folder.path / name)

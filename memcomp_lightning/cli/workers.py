@@ -1,4 +1,4 @@
-"""Processes that train the networks of a figure."""
+"""Processes that train many networks."""
 
 import multiprocessing
 import os
@@ -12,11 +12,9 @@ from functools import partial
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
-from memcomp_lightning.cli.units import Progress, Unit, device_of, run_unit
+from memcomp_lightning.cli.units import Progress, device_of
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.report import Record
 
 
 def _n_cores() -> int:
@@ -24,24 +22,29 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-Runner = Callable[[Sequence[Unit], Progress], Iterator[list[Record]]]
+Runner = Callable[[Sequence[Any], Progress], Iterator[list[Any]]]
 
 
 @contextmanager
-def runner(config: DictConfig) -> Iterator[Runner]:
-    """What trains units: this process, or as many others as there are cores, each on one thread."""
-    workers = config.figure.workers
+def runner(workers: int | None, accelerator: str, train: Callable[[Any, Progress], list[Any]]) -> Iterator[Runner]:
+    """What trains many units: this process, or several others, each on one thread.
+
+    Args:
+        workers: Processes; None is one for each core, one in all with a GPU.
+        accelerator: The trainer's setting.
+        train: Trains one unit and returns its records; a function of a module, which processes can import.
+    """
     if workers is None:
-        workers = 1 if device_of(config.trainer.accelerator).type != "cpu" else _n_cores()
-    require_count("figure.workers", workers)
+        workers = 1 if device_of(accelerator).type != "cpu" else _n_cores()
+    require_count("workers", workers)
     if workers == 1:
-        yield _run_here
+        yield partial(_run_here, train)
         return
     context = multiprocessing.get_context("spawn")
     messages = context.SimpleQueue()
     pool = ProcessPoolExecutor(workers, context, initializer=_begin_worker, initargs=(messages,))
     try:
-        yield partial(_run_in_pool, pool, messages)
+        yield partial(_run_in_pool, pool, messages, train)
     except BaseException:
         for process in list(pool._processes.values()):
             process.terminate()
@@ -50,15 +53,15 @@ def runner(config: DictConfig) -> Iterator[Runner]:
         pool.shutdown(cancel_futures=True)
 
 
-def _run_here(units: Sequence[Unit], progress: Progress) -> Iterator[list[Record]]:
+def _run_here(train: Any, units: Sequence[Any], progress: Progress) -> Iterator[list[Any]]:
     for unit in units:
-        yield run_unit(unit, progress)
+        yield train(unit, progress)
 
 
 def _run_in_pool(
-    pool: ProcessPoolExecutor, messages: Any, units: Sequence[Unit], progress: Progress
-) -> Iterator[list[Record]]:
-    running = {pool.submit(_run_in_worker, unit) for unit in units}
+    pool: ProcessPoolExecutor, messages: Any, train: Any, units: Sequence[Any], progress: Progress
+) -> Iterator[list[Any]]:
+    running = {pool.submit(_run_in_worker, train, unit) for unit in units}
     while running:
         done, running = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
         while not messages.empty():
@@ -87,7 +90,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _run_in_worker(unit: Unit) -> list[Record]:
+def _run_in_worker(train: Any, unit: Any) -> list[Any]:
     last, waiting = time.monotonic(), 0
 
     def report(what: str, n_updates: int) -> None:
@@ -97,6 +100,6 @@ def _run_in_worker(unit: Unit) -> list[Record]:
             _messages.put((what, waiting))
             last, waiting = time.monotonic(), 0
 
-    records = run_unit(unit, report)
+    records: list[Any] = train(unit, report)
     _messages.put((unit.title, waiting))
     return records

@@ -3,6 +3,7 @@
 from memcomp_lightning.plotting.accuracy import plot_against_iterations, plot_against_passes, plot_controls
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.plotting.trajectory import plot_trajectory
+from memcomp_lightning.plotting.worth import plot_worth
 
 __all__ = [
     "picture_grid",
@@ -10,4 +11,5 @@ __all__ = [
     "plot_against_passes",
     "plot_controls",
     "plot_trajectory",
+    "plot_worth",
 ]

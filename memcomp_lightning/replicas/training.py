@@ -22,7 +22,7 @@ from memcomp_lightning.modules.stage import diverged_parameter
 from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
-from memcomp_lightning.types import NegativePhase
+from memcomp_lightning.types import Configurations, NegativePhase
 
 
 class Rates(NamedTuple):
@@ -45,6 +45,20 @@ class Rates(NamedTuple):
                 group["momentum"] = self.momentum(iteration)
         if self.learning_rate is not None:
             set_learning_rate(optimizer, self.learning_rate(iteration))
+
+
+class Pass(NamedTuple):
+    """What a pass of pretraining leaves.
+
+    Attributes:
+        number: Passes done, from 1.
+        state: Of the sampler.
+        positive: Positive phase of the last batch.
+    """
+
+    number: int
+    state: Any
+    positive: Configurations
 
 
 def pretrain(
@@ -88,8 +102,8 @@ def pretrain_layer(
     rates: Rates,
     centring: Centring | None = None,
     generator: Generator,
-) -> Iterator[int]:
-    """Train one RBM of a DBN in place; yield the number of each pass once it is done.
+) -> Iterator[Pass]:
+    """Train one RBM of a DBN in place; yield each pass once it is done.
 
     Arguments are those of :func:`pretrain`, with the index of the layer and the stream of the negative phase.
 
@@ -119,7 +133,7 @@ def pretrain_layer(
                 optimizer.step()
                 optimizer.zero_grad()
                 negative = None
-        yield iteration + 1
+        yield Pass(iteration + 1, state, positive)
     _check_finite(rbm, f"pretraining, layer {layer + 1}")
 
 

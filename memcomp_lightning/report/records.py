@@ -4,12 +4,15 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
+
+LineT = TypeVar("LineT")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,30 +58,41 @@ class Record:
         return np.take_along_axis(test, best, axis=0)
 
 
-class Records:
-    """The records of a folder, in the order in which they were made.
+class JsonLines(Generic[LineT]):
+    """Records of one kind in a file, a line each, appended as soon as they exist.
+
+    Args:
+        path: The file; it need not exist.
+        kind: Dataclass of a record.
 
     Raises:
         SettingError: A line of the file is damaged; an unfinished last line is dropped.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / "records.jsonl"
-        self.all: list[Record] = []
+    def __init__(self, path: Path, kind: type[LineT]) -> None:
+        self.path = path
+        self.all: list[LineT] = []
         lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
         for number, line in enumerate(lines, start=1):
             try:
-                self.all.append(Record(**json.loads(line)))
+                self.all.append(kind(**json.loads(line)))
             except (json.JSONDecodeError, TypeError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
                 write_text(self.path, "".join(_line(record) for record in self.all))
 
-    def append(self, records: Iterable[Record]) -> None:
+    def append(self, records: Iterable[LineT]) -> None:
         """Add records to the list and to the file."""
         new = list(records)
         with self.path.open("a", encoding="utf-8") as file:
             file.write("".join(_line(record) for record in new))
         self.all += new
+
+
+class Records(JsonLines[Record]):
+    """Records of the folder of a figure, ``records.jsonl``."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder / "records.jsonl", Record)
 
     def has(self, curve: str, choice: float | None, choosing: bool, iterations: int, seed: int) -> bool:
         """Whether this network was measured already."""
@@ -98,5 +112,5 @@ class Records:
         return sorted(own, key=lambda record: (record.iterations, record.seed))
 
 
-def _line(record: Record) -> str:
+def _line(record: Any) -> str:
     return json.dumps(asdict(record)) + "\n"

@@ -1,0 +1,64 @@
+"""What a sampler is worth: likelihood against updates and against time, and the bias of the gradient."""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from memcomp_lightning.report.worth import Worth
+
+
+def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: float = 4.6) -> Figure:
+    """Panels of one data set: score against updates and against seconds, cosine with the exact gradient.
+
+    Lines are medians over replicas, each method at its best learning rate; the dotted line of a judged method is
+    its worst replica.
+
+    Args:
+        worth: What was measured.
+        data_set: Name of the data set.
+        width: Inches.
+        height: Inches.
+    """
+    figure = Figure(figsize=(width, height), layout="constrained")
+    by_update, by_time, bias = figure.subplots(1, 3)
+    settings = worth.plan["data_sets"][data_set]
+    for number, method in enumerate(worth.methods(data_set)):
+        course, scores = worth.best(data_set, method), worth.values(worth.best(data_set, method))
+        claimed = method in worth.plan["claimed"]
+        style = {"color": f"C{number % 10}", "ls": "-" if claimed else "--", "lw": 1.6 if claimed else 1.0}
+        label = f"{worth.plan['methods'][method]['label']} (lr = {course.rate:g})"
+        median, worst = np.median(scores, axis=1), scores.max(axis=1)
+        for axes, x in ((by_update, course.updates), (by_time, course.seconds)):
+            axes.plot(x, median, label=label, **style)
+            if claimed:
+                axes.plot(x, worst, color=style["color"], ls=":", lw=0.8)
+        cosines = worth.values(course, "cosines")
+        if np.isfinite(cosines).any():
+            bias.plot(course.updates, np.nanmedian(cosines, axis=1), **style)
+    measure = "KL divergence of the data, nats" if settings["measure"] == "kl" else "negative log-likelihood, nats"
+    by_update.set(xlabel="updates", ylabel=measure, xscale="log")
+    by_time.set(xlabel=f"seconds of {worth.plan['replicas'] + worth.plan['choosing']} replicas", xscale="log")
+    bias.set(xlabel="updates", ylabel="cosine of the mean gradient with the exact one", xscale="log")
+    for axes in (by_update, by_time):
+        _finite_range(axes)
+        if settings["measure"] == "kl":
+            axes.set_yscale("log")
+    for axes in (by_update, by_time, bias):
+        axes.grid(alpha=0.25)
+        axes.tick_params(labelsize=8)
+    handles, labels = by_update.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7, frameon=False)
+    figure.suptitle(settings["label"], size=10)
+    return figure
+
+
+def _finite_range(axes: Axes) -> None:
+    """Leave out what diverged: the range is that of the finite values up to twice the first one."""
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
+    values = values[np.isfinite(values) & (values > 0)]
+    if values.size:
+        first = float(np.median([np.asarray(line.get_ydata(), dtype=float)[0] for line in axes.get_lines()]))
+        top = 1.3 * first if math.isfinite(first) else float(values.max())
+        axes.set_ylim(float(values.min()) / 1.1, max(top, float(values.min()) * 1.1))
