@@ -2,6 +2,8 @@
 
 from memcomp_lightning.plotting.accuracy import plot_against_iterations, plot_against_passes, plot_controls
 from memcomp_lightning.plotting.grid import picture_grid
+from memcomp_lightning.plotting.histograms import plot_histograms
+from memcomp_lightning.plotting.rendering import rendered
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 
 __all__ = [
@@ -9,5 +11,7 @@ __all__ = [
     "plot_against_iterations",
     "plot_against_passes",
     "plot_controls",
+    "plot_histograms",
     "plot_trajectory",
+    "rendered",
 ]
