@@ -2,6 +2,7 @@
 
 from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
+from memcomp_lightning.callbacks.energy_histograms import EnergyHistograms
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
@@ -11,10 +12,12 @@ from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
 from memcomp_lightning.callbacks.pictures import ModelSamples, ReceptiveFields
 from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
+from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
 
 __all__ = [
     "BestWeights",
     "ClassificationMetrics",
+    "EnergyHistograms",
     "FreeEnergyGap",
     "HyperParameters",
     "ModelSamples",
@@ -24,5 +27,6 @@ __all__ = [
     "ParameterHistograms",
     "ReceptiveFields",
     "ReconstructionError",
+    "SamplerDiagnostics",
     "StageProgressBar",
 ]
