@@ -4,6 +4,7 @@ from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
 from memcomp_lightning.callbacks.energy_histograms import EnergyHistograms
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
+from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
 from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
@@ -19,6 +20,7 @@ __all__ = [
     "ClassificationMetrics",
     "EnergyHistograms",
     "FreeEnergyGap",
+    "GradientBias",
     "HyperParameters",
     "ModelSamples",
     "MomentumSchedule",
