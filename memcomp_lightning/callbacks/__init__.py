@@ -14,6 +14,7 @@ from memcomp_lightning.callbacks.pictures import ModelSamples, ReceptiveFields
 from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
+from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
 
 __all__ = [
     "BestWeights",
@@ -30,5 +31,6 @@ __all__ = [
     "ReceptiveFields",
     "ReconstructionError",
     "SamplerDiagnostics",
+    "SaturationGuard",
     "StageProgressBar",
 ]

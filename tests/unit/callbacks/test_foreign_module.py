@@ -23,6 +23,7 @@ from memcomp_lightning.callbacks import (
     ReceptiveFields,
     ReconstructionError,
     SamplerDiagnostics,
+    SaturationGuard,
     StageProgressBar,
 )
 from memcomp_lightning.callbacks.base import rbm_of
@@ -40,6 +41,7 @@ def all_callbacks() -> list[pl.Callback]:
         ParameterHistograms(every=1),
         ReceptiveFields(every=1, n_units=4),
         ModelSamples(every=1, n_samples=4, n_sweeps=3),
+        SaturationGuard(),
         ClassificationMetrics(),
         HyperParameters({"model": {"n_hidden": 5}}, metrics=[f"{PREFIX}/reconstruction_error", "not_logged"]),
         StageProgressBar(),
