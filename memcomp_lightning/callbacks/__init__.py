@@ -15,6 +15,7 @@ from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
 from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
+from memcomp_lightning.callbacks.stage_times import StageTimes
 
 __all__ = [
     "BestWeights",
@@ -33,4 +34,5 @@ __all__ = [
     "SamplerDiagnostics",
     "SaturationGuard",
     "StageProgressBar",
+    "StageTimes",
 ]

@@ -25,12 +25,14 @@ from memcomp_lightning.callbacks import (
     SamplerDiagnostics,
     SaturationGuard,
     StageProgressBar,
+    StageTimes,
 )
 from memcomp_lightning.callbacks.base import rbm_of
 
 
 def all_callbacks() -> list[pl.Callback]:
     return [
+        StageTimes(),
         ReconstructionError(),
         FreeEnergyGap(n_images=7),
         NegativePhaseEnergies(),
@@ -72,6 +74,9 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "negative_phase/autocorrelation_time",
         "gradient_bias/cosine",
         "gradient_bias/relative_error",
+        "seconds/training_s",
+        "seconds/validation_s",
+        "seconds/other_s",
         "learning_rate",
         "momentum",
         "loss",
@@ -118,6 +123,7 @@ def test_callbacks_change_no_bit_of_training(tmp_path: Path, kind: type[TheirRBM
     if kind is TheirRBM:
         written = (tmp_path / "csv/version_0/metrics.csv").read_text()
         assert "energy_model" in written
+        assert "seconds/training_s" in written
 
 
 def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> None:
