@@ -16,6 +16,7 @@ from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
 from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
 from memcomp_lightning.callbacks.stage_times import StageTimes
+from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
 __all__ = [
     "BestWeights",
@@ -35,4 +36,5 @@ __all__ = [
     "SaturationGuard",
     "StageProgressBar",
     "StageTimes",
+    "TrajectoryFigure",
 ]

@@ -26,6 +26,7 @@ from memcomp_lightning.callbacks import (
     SaturationGuard,
     StageProgressBar,
     StageTimes,
+    TrajectoryFigure,
 )
 from memcomp_lightning.callbacks.base import rbm_of
 
@@ -43,6 +44,7 @@ def all_callbacks() -> list[pl.Callback]:
         ParameterHistograms(every=1),
         ReceptiveFields(every=1, n_units=4),
         ModelSamples(every=1, n_samples=4, n_sweeps=3),
+        TrajectoryFigure(every=1),
         SaturationGuard(),
         ClassificationMetrics(),
         HyperParameters({"model": {"n_hidden": 5}}, metrics=[f"{PREFIX}/reconstruction_error", "not_logged"]),
@@ -85,7 +87,7 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "heldout_accuracy",
     }
     assert {f"{PREFIX}/{name}" for name in scalars} <= set(tags["scalars"])
-    pictures = {"receptive_fields", "samples", "energies"}
+    pictures = {"receptive_fields", "samples", "energies", "trajectory"}
     assert set(tags["images"]) == {f"{PREFIX}/{name}" for name in pictures}
     histograms = {"weight", "b", "c", "energies_data", "energies_model"}
     assert {f"{PREFIX}/{name}" for name in histograms} <= set(tags["histograms"])
