@@ -10,7 +10,7 @@ from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
 from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
-from memcomp_lightning.callbacks.pictures import ModelSamples, ReceptiveFields
+from memcomp_lightning.callbacks.pictures import ChainPictures, ModelSamples, ReceptiveFields
 from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
@@ -20,6 +20,7 @@ from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
 __all__ = [
     "BestWeights",
+    "ChainPictures",
     "ClassificationMetrics",
     "EnergyHistograms",
     "FreeEnergyGap",

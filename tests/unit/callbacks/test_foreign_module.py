@@ -10,6 +10,7 @@ from foreign import IMAGES, PREFIX, TheirChains, TheirRBM, events_in, fit, tenso
 from lightning.pytorch.loggers import CSVLogger
 
 from memcomp_lightning.callbacks import (
+    ChainPictures,
     ClassificationMetrics,
     EnergyHistograms,
     FreeEnergyGap,
@@ -44,6 +45,7 @@ def all_callbacks() -> list[pl.Callback]:
         ParameterHistograms(every=1),
         ReceptiveFields(every=1, n_units=4),
         ModelSamples(every=1, n_samples=4, n_sweeps=3),
+        ChainPictures(every=1, n_chains=4),
         TrajectoryFigure(every=1),
         SaturationGuard(),
         ClassificationMetrics(),
@@ -87,7 +89,7 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "heldout_accuracy",
     }
     assert {f"{PREFIX}/{name}" for name in scalars} <= set(tags["scalars"])
-    pictures = {"receptive_fields", "samples", "energies", "trajectory"}
+    pictures = {"receptive_fields", "samples", "chains", "energies", "trajectory"}
     assert set(tags["images"]) == {f"{PREFIX}/{name}" for name in pictures}
     histograms = {"weight", "b", "c", "energies_data", "energies_model"}
     assert {f"{PREFIX}/{name}" for name in histograms} <= set(tags["histograms"])
