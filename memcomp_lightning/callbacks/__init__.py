@@ -7,6 +7,7 @@ from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
 from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
+from memcomp_lightning.callbacks.log_likelihood import LogLikelihood
 from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
@@ -26,6 +27,7 @@ __all__ = [
     "FreeEnergyGap",
     "GradientBias",
     "HyperParameters",
+    "LogLikelihood",
     "ModelSamples",
     "MomentumSchedule",
     "NegativePhaseEnergies",
