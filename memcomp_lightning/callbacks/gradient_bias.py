@@ -42,7 +42,7 @@ class GradientBias(EveryIterations):
         SettingError: At the start of training, if a smaller layer has more than 16 units.
     """
 
-    def __init__(self, every: int = 10) -> None:
+    def __init__(self, every: int = 20) -> None:
         super().__init__(every)
         self._before: Any = None
 

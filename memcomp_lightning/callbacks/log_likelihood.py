@@ -93,7 +93,7 @@ class LogLikelihood(EveryIterations):
         """Start a new sum, and the draws of the same bits as before."""
         self._heldout = []
         self._judged_at = trainer.global_step
-        self._bits = rng.stream(self.seed, "binarisation", 1)
+        self._bits = rng.stream(self.seed, "log_likelihood", 1)
 
     @torch.no_grad()
     def on_validation_batch_end(
@@ -117,7 +117,7 @@ class LogLikelihood(EveryIterations):
         log_z = values["log_z"]
         train = self._train.images()
         if train is not None:
-            total = self._total(rbm, train, rng.stream(self.seed, "binarisation", 0))
+            total = self._total(rbm, train, rng.stream(self.seed, "log_likelihood", 0))
             values["log_likelihood_train"] = total / train.shape[-2] - log_z
         # A validation in the middle of the pass has judged another model.
         if self._heldout and self._judged_at == trainer.global_step:
@@ -132,7 +132,7 @@ class LogLikelihood(EveryIterations):
         if self.method == "exact":
             return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
-        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "annealing"))
+        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "log_likelihood", 2))
         return {
             "log_z": estimate.log_z,
             "log_z_standard_error": estimate.standard_error,

@@ -30,8 +30,8 @@ def test_values_against_enumeration(tmp_path: Path, kind: type[TheirRBM], method
     module, trainer = fit(tmp_path, [callback], module=kind())
     rbm, logged, prefix = module.rbm, trainer.callback_metrics, kind.__name__
     train = IMAGES[10:].expand(*rbm.replicas, -1, -1)  # the last batches that hold at least seven images
-    train = rng.bernoulli(train, generator=rng.stream(4, "binarisation", 0))
-    bits = rng.stream(4, "binarisation", 1)
+    train = rng.bernoulli(train, generator=rng.stream(4, "log_likelihood", 0))
+    bits = rng.stream(4, "log_likelihood", 1)
     batches = [rng.bernoulli(part.expand(*rbm.replicas, -1, -1), generator=bits) for part in IMAGES.split(5)]
     with torch.no_grad():
         log_z = likelihood_stand_in.log_partition_function(rbm)
