@@ -1,5 +1,6 @@
 """Likelihoods as torchmetrics: sums over batches and processes, one value for each replica."""
 
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -48,7 +49,7 @@ class MeanLogLikelihood(_MeanOverImages):
             v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
             log_z: Logarithm of the model's partition function, ``(*replicas,)``.
         """
-        from memcomp_lightning import likelihood  # type: ignore[attr-defined]
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
 
         self._add(likelihood.log_likelihood(model, v, log_z))
 
@@ -69,6 +70,6 @@ class MeanLogPseudoLikelihood(_MeanOverImages):
             model: The energy model.
             v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
         """
-        from memcomp_lightning import likelihood  # type: ignore[attr-defined]
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
 
         self._add(likelihood.log_pseudo_likelihood(model, v).sum(-1))

@@ -1,6 +1,7 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any, Literal
 
 import lightning.pytorch as pl
@@ -28,17 +29,17 @@ class LogLikelihood(EveryIterations):
     callback's own, the same draws each time. In upper layers of a stack the "images" are mean activations, drawn
     likewise, and the likelihood is that of the layer.
 
-    By annealed importance sampling (Salakhutdinov & Murray 2008) log Z is an estimate that tends to be too small,
-    the likelihood too large; ``log_z_standard_error`` and ``log_z_effective_sample_size``, of ``n_chains``, say
-    how far to trust it.
+    By annealed importance sampling (Salakhutdinov & Murray 2008), from independent units with the means of the
+    training images, log Z is an estimate that tends to be too small, the likelihood too large;
+    ``log_z_standard_error`` and ``log_z_effective_sample_size``, of ``n_chains``, say how far to trust it.
 
     Args:
         every: Passes between two values, >= 1.
         method: "exact" enumerates the smaller layer; "ais" estimates log Z at any size.
         n_images: Training images a replica to judge, >= 1.
         max_units: Largest smaller layer to enumerate, >= 1.
-        n_chains: Chains of AIS, >= 1.
-        n_betas: Temperatures of AIS, >= 2.
+        n_chains: Chains of AIS, >= 2.
+        n_betas: Steps of AIS, >= 1.
         seed: Seed of the draws.
 
     Raises:
@@ -59,8 +60,8 @@ class LogLikelihood(EveryIterations):
         super().__init__(every)
         require_choice("method", method, ("exact", "ais"))
         require_count("max_units", max_units)
-        require_count("n_chains", n_chains)
-        require_count("n_betas", n_betas, minimum=2)
+        require_count("n_chains", n_chains, minimum=2)
+        require_count("n_betas", n_betas)
         self.method = method
         self.max_units = max_units
         self.n_chains = n_chains
@@ -113,9 +114,9 @@ class LogLikelihood(EveryIterations):
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Normalise."""
         rbm = rbm_of(pl_module)
-        values = self._partition_function(rbm)
-        log_z = values["log_z"]
         train = self._train.images()
+        values = self._partition_function(rbm, train)
+        log_z = values["log_z"]
         if train is not None:
             total = self._total(rbm, train, rng.stream(self.seed, "log_likelihood", 0))
             values["log_likelihood_train"] = total / train.shape[-2] - log_z
@@ -125,14 +126,15 @@ class LogLikelihood(EveryIterations):
             values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
         log_scalars(pl_module, values)
 
-    def _partition_function(self, rbm: Any) -> dict[str, Tensor]:
+    def _partition_function(self, rbm: Any, train: Tensor | None) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
-        from memcomp_lightning import likelihood  # type: ignore[attr-defined]
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
 
         if self.method == "exact":
             return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
-        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "log_likelihood", 2))
+        base = None if train is None else likelihood.base_of(train)
+        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
         return {
             "log_z": estimate.log_z,
             "log_z_standard_error": estimate.standard_error,
@@ -142,7 +144,7 @@ class LogLikelihood(EveryIterations):
     @staticmethod
     def _total(rbm: Any, v: Tensor, bits: Generator) -> Tensor:
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
-        from memcomp_lightning import likelihood  # type: ignore[attr-defined]
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
 
         log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
         total: Tensor = likelihood.log_likelihood(rbm, rng.bernoulli(v, generator=bits), log_z).double().sum(-1)

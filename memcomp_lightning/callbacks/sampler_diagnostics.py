@@ -24,7 +24,8 @@ class SamplerDiagnostics(EveryIterations):
       passes that ``history`` spans means "at least so much".
 
     Chains persist unless the module's ``sampler`` begins with :class:`NoState` or the configurations are weighted.
-    The series starts afresh with each layer; it is in checkpoints.
+    The series starts afresh with each layer. It is in checkpoints, that of the first process: of several processes
+    the others begin theirs with it, so that the first values after a resume are rough.
 
     Args:
         every: Passes between two looks, >= 1.

@@ -62,8 +62,8 @@ def test_a_model_too_large_to_enumerate_is_refused_before_training(tmp_path: Pat
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(SettingError, match=r"method = 'guess'.*'exact', 'ais'"):
         LogLikelihood(method="guess")  # type: ignore[arg-type]
-    with pytest.raises(SettingError, match="n_betas = 1"):
-        LogLikelihood(n_betas=1)
+    with pytest.raises(SettingError, match="n_chains = 1"):
+        LogLikelihood(n_chains=1)
 
 
 def test_metrics_add_up_over_batches_and_processes() -> None:
