@@ -54,15 +54,31 @@ def rbm_of(module: pl.LightningModule) -> Any:
     return module.rbm
 
 
-def log_scalars(module: pl.LightningModule, values: Mapping[str, Tensor | float]) -> None:
-    """Log means over replicas and processes at the end of an epoch."""
+def log_scalars(
+    module: pl.LightningModule, values: Mapping[str, Tensor | float], *, of_first_process: bool = False
+) -> None:
+    """Log means over replicas and processes at the end of an epoch.
+
+    Args:
+        module: Logs them.
+        values: By name, which the module's prefix precedes.
+        of_first_process: With several processes, log the values of the first alone: needed where names may
+            differ from process to process, for which a mean over processes would wait forever.
+    """
     prefix = prefix_of(module)
     means = {
         f"{prefix}/{name}": torch.as_tensor(value, dtype=torch.float32, device=module.device).mean()
         for name, value in values.items()
     }
     distributed = module.trainer.world_size > 1
-    module.log_dict(means, on_step=False, on_epoch=True, sync_dist=distributed, batch_size=1)
+    module.log_dict(
+        means,
+        on_step=False,
+        on_epoch=True,
+        sync_dist=distributed and not of_first_process,
+        rank_zero_only=distributed and of_first_process,
+        batch_size=1,
+    )
 
 
 def tensorboards(trainer: pl.Trainer) -> list[Any]:

@@ -30,8 +30,9 @@ class GradientBias(EveryIterations):
     With g the gradient of the contrast of the batch's ``positive`` and ``negative`` configurations, and g* that of
     ``positive`` and the exact expectation, they are ``g.g* / |g||g*|`` and ``|g - g*| / |g*|``, weights and biases
     together, means over replicas. The noise of one batch's chains is in them, too: it falls with the number of
-    chains, the bias of the sampler does not. Both gradients are taken at the parameters that the sampler met,
-    before the step, and on a copy: ``grad`` of the model is not touched.
+    chains, the bias of the sampler does not. Both are plain gradients, also where training follows another one
+    (centred, with weight decay), at the parameters that the sampler met, before the step; they are taken on a
+    copy, so that ``grad`` of the model is not touched.
 
     The smaller layer is enumerated, with 2^units times units of the larger layer numbers for each replica.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, prefix_of, rbm_of, required
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.types import Configurations, NoState
+from memcomp_lightning.types import Configurations
 
 
 class SamplerDiagnostics(EveryIterations):
@@ -23,9 +23,9 @@ class SamplerDiagnostics(EveryIterations):
       :func:`autocorrelation_time`. It needs at least two looks and two chains. A value above a tenth of the
       passes that ``history`` spans means "at least so much".
 
-    Chains persist unless the module's ``sampler`` begins with :class:`NoState` or the configurations are weighted.
-    The series starts afresh with each layer. It is in checkpoints, that of the first process: of several processes
-    the others begin theirs with it, so that the first values after a resume are rough.
+    Chains persist if the state that the module's ``sampler`` begins with holds visible states, and in modules
+    without one; weighted configurations are no chains. The series starts afresh with each layer, and is in
+    checkpoints. With several processes all values are those of the first.
 
     Args:
         every: Passes between two looks, >= 1.
@@ -44,7 +44,9 @@ class SamplerDiagnostics(EveryIterations):
         """Report, and add to the series."""
         negative = required(outputs, "negative", self)
         values = {**outputs.get("info", {}), **self._mixing(pl_module, negative)}
-        log_scalars(pl_module, {f"negative_phase/{key}": value for key, value in values.items()})
+        # What a sampler reports may depend on a draw of its process (mode-assisted training tosses a coin).
+        tagged = {f"negative_phase/{key}": value for key, value in values.items()}
+        log_scalars(pl_module, tagged, of_first_process=True)
 
     def _mixing(self, module: pl.LightningModule, negative: Configurations) -> dict[str, Tensor]:
         if negative.weight is not None or not _chains_persist(module):
@@ -52,7 +54,7 @@ class SamplerDiagnostics(EveryIterations):
         if prefix_of(module) != self._stage or self._v is None or self._v.shape != negative.v.shape:
             self._stage, self._energies, self._v = prefix_of(module), [], None
         values = {}
-        v = negative.v.cpu()
+        v = negative.v.detach().clone().cpu()  # a sampler of somebody else's may go on in the same tensor
         if self._v is not None:
             values["bits_changed"] = (v - self._v).abs().mean((-1, -2))
         energy = rbm_of(module).energy(negative.v, negative.h).cpu()
@@ -104,4 +106,12 @@ def _chains_persist(module: pl.LightningModule) -> bool:
     init = getattr(getattr(module, "sampler", None), "init", None)
     if init is None:
         return True
-    return not isinstance(init(rbm_of(module), 1, generator=rng.stream(0, "check")), NoState)
+    rbm = rbm_of(module)
+    return _holds_chains(init(rbm, 1, generator=rng.stream(0, "check")), rbm.n_visible)
+
+
+def _holds_chains(state: Any, n_visible: int) -> bool:
+    """Whether a sampler's state, or one in it, holds visible states."""
+    if isinstance(state, Tensor):
+        return state.ndim >= 2 and state.shape[-1] == n_visible
+    return isinstance(state, tuple) and any(_holds_chains(part, n_visible) for part in state)

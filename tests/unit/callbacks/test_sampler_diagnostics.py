@@ -1,7 +1,7 @@
 """Mixing of chains: times of processes whose time is known, and what is logged."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -93,9 +93,20 @@ def test_a_resumed_run_goes_on_with_the_series(tmp_path: Path) -> None:
         assert resumed.callback_metrics[key] == uninterrupted.callback_metrics[key]
 
 
+class Wraps(NamedTuple):
+    """A sampler of which only the state matters: it holds that of another, and a count."""
+
+    inner: Any
+
+    def init(self, model: Any, n_chains: int, *, generator: torch.Generator) -> Any:
+        return torch.zeros(()), self.inner.init(model, n_chains, generator=generator)
+
+
 @fits
 @quiet
-@pytest.mark.parametrize(("sampler", "persists"), [(CD(), False), (PCD(), True)])
+@pytest.mark.parametrize(
+    ("sampler", "persists"), [(CD(), False), (PCD(), True), (Wraps(CD()), False), (Wraps(PCD()), True)]
+)
 def test_chains_that_start_at_the_data_have_no_mixing(tmp_path: Path, sampler: Any, persists: bool) -> None:
     module = TheirRBM()
     module.sampler = sampler
