@@ -2,23 +2,34 @@
 
 from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
+from memcomp_lightning.callbacks.energy_histograms import EnergyHistograms
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
+from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
 from memcomp_lightning.callbacks.learning_rate_decay import LearningRateDecay
+from memcomp_lightning.callbacks.log_likelihood import LogLikelihood
 from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
-from memcomp_lightning.callbacks.pictures import ModelSamples, ReceptiveFields
+from memcomp_lightning.callbacks.pictures import ChainPictures, ModelSamples, ReceptiveFields
 from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
+from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
+from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
+from memcomp_lightning.callbacks.stage_times import StageTimes
+from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
 __all__ = [
     "BestWeights",
+    "ChainPictures",
     "ClassificationMetrics",
+    "EnergyHistograms",
     "FreeEnergyGap",
+    "GradientBias",
     "HyperParameters",
     "LearningRateDecay",
+    "LogLikelihood",
     "ModelSamples",
     "MomentumSchedule",
     "NegativePhaseEnergies",
@@ -26,5 +37,9 @@ __all__ = [
     "ParameterHistograms",
     "ReceptiveFields",
     "ReconstructionError",
+    "SamplerDiagnostics",
+    "SaturationGuard",
     "StageProgressBar",
+    "StageTimes",
+    "TrajectoryFigure",
 ]

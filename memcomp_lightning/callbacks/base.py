@@ -11,8 +11,9 @@ A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.m
 dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
 
 Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
-epoch), ``progress`` (text of the progress bar), ``images_of(v)`` (inputs that visible states stand for),
-``dbn`` and ``layer`` (the stack that ``rbm`` is part of, for receptive fields), ``active_optimizer``.
+epoch), ``iterations`` (passes of a stage or layer, default the trainer's ``max_epochs``), ``progress`` (text of
+the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``dbn`` and ``layer`` (the stack that
+``rbm`` is part of), ``sampler`` (tells whether chains persist, default yes), ``active_optimizer``.
 """
 
 from abc import ABC, abstractmethod
@@ -22,9 +23,11 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from matplotlib.figure import Figure
 from torch import Tensor
 
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.plotting.rendering import rendered
 
 
 def prefix_of(module: pl.LightningModule) -> str:
@@ -51,15 +54,31 @@ def rbm_of(module: pl.LightningModule) -> Any:
     return module.rbm
 
 
-def log_scalars(module: pl.LightningModule, values: Mapping[str, Tensor | float]) -> None:
-    """Log means over replicas and processes at the end of an epoch."""
+def log_scalars(
+    module: pl.LightningModule, values: Mapping[str, Tensor | float], *, of_first_process: bool = False
+) -> None:
+    """Log means over replicas and processes at the end of an epoch.
+
+    Args:
+        module: Logs them.
+        values: By name, which the module's prefix precedes.
+        of_first_process: With several processes, log the values of the first alone: needed where names may
+            differ from process to process, for which a mean over processes would wait forever.
+    """
     prefix = prefix_of(module)
     means = {
         f"{prefix}/{name}": torch.as_tensor(value, dtype=torch.float32, device=module.device).mean()
         for name, value in values.items()
     }
     distributed = module.trainer.world_size > 1
-    module.log_dict(means, on_step=False, on_epoch=True, sync_dist=distributed, batch_size=1)
+    module.log_dict(
+        means,
+        on_step=False,
+        on_epoch=True,
+        sync_dist=distributed and not of_first_process,
+        rank_zero_only=distributed and of_first_process,
+        batch_size=1,
+    )
 
 
 def tensorboards(trainer: pl.Trainer) -> list[Any]:
@@ -69,17 +88,77 @@ def tensorboards(trainer: pl.Trainer) -> list[Any]:
     return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
 
 
+def write_figure(trainer: pl.Trainer, module: pl.LightningModule, tag: str, figure: Figure) -> None:
+    """Write a figure to every TensorBoard logger."""
+    for board in tensorboards(trainer):
+        tag_of_stage = f"{prefix_of(module)}/{tag}"
+        board.add_image(tag_of_stage, rendered(figure), trainer.global_step, dataformats="HWC")
+
+
+def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_units: int) -> None:
+    """Refuse models whose smaller layer is too large to enumerate: all of the module's stack, before training.
+
+    Raises:
+        SettingError: Naming callback and size.
+    """
+    dbn = getattr(module, "dbn", None)
+    for rbm in [rbm_of(module)] if dbn is None else dbn:
+        n_units = min(rbm.n_visible, rbm.n_hidden)
+        name = type(callback).__name__
+        require(
+            n_units <= max_units,
+            f"size of the smaller layer for {name}",
+            n_units,
+            f"at most {max_units} units, because all their states are enumerated",
+            f"Leave {name} out, or train a model with a smaller layer.",
+        )
+
+
+class LastImages:
+    """Visible states of the last batches of a pass.
+
+    Args:
+        n: Batches are kept until they hold so many images a replica, >= 1.
+    """
+
+    def __init__(self, n: int) -> None:
+        require_count("n_images", n)
+        self.n = n
+        self._batches: list[Tensor] = []
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._batches = []
+
+    def add(self, v: Tensor) -> None:
+        """Keep references to the images ``(*replicas, n, n_visible)`` of a batch."""
+        self._batches.append(v[..., : self.n, :])
+        while sum(kept.shape[-2] for kept in self._batches[1:]) >= self.n:
+            self._batches.pop(0)
+
+    def images(self) -> Tensor | None:
+        """The kept images, ``(*replicas, n, n_visible)``; None before the first batch."""
+        return torch.cat(self._batches, dim=-2) if self._batches else None
+
+
 class EveryIterations(pl.Callback, ABC):
     """A callback that looks at the last batch of a pass, every so many passes.
 
     Args:
-        every: Passes between two looks, >= 1; the first pass is always looked at.
+        every: Passes between two looks, >= 1; the first pass and the last one of a stage or layer are always
+            looked at.
     """
 
     def __init__(self, every: int = 1) -> None:
         require_count("every", every)
         self.every = every
         self._outputs: Mapping[str, Any] = {}
+
+    def is_due(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> bool:
+        """Whether the present pass is looked at."""
+        iteration = iteration_of(pl_module)
+        n_iterations = getattr(pl_module, "iterations", trainer.max_epochs)
+        return iteration % self.every == 0 or iteration + 1 == n_iterations
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -90,7 +169,7 @@ class EveryIterations(pl.Callback, ABC):
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Look, if it is time."""
         outputs, self._outputs = self._outputs, {}
-        if iteration_of(pl_module) % self.every == 0:
+        if self.is_due(trainer, pl_module):
             with torch.no_grad():
                 self.look(trainer, pl_module, outputs)
 

@@ -6,38 +6,36 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from memcomp_lightning.callbacks.base import log_scalars, rbm_of, required
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.callbacks.base import LastImages, log_scalars, rbm_of, required
 
 
 class FreeEnergyGap(pl.Callback):
     """Logs ``free_energy_train``, ``free_energy_heldout`` and their difference ``free_energy_gap``.
 
-    The unknown log Z cancels in ``mean F(held-out) - mean F(train) = mean log p(train) - mean log
-    p(held-out)``: a gap that grows is overfitting (Hinton 2010, section 6). Training images are those of
-    the pass's last batches, judged by the same model as the held-out ones.
+    The overfitting monitor of Hinton 2010, section 6. The unknown log Z cancels in ``mean F(held-out) - mean
+    F(train) = mean log p(train) - mean log p(held-out)``: the gap is about zero at first, and one that grows is
+    overfitting, by so many nats an image. Free energies alone say nothing, and gaps of different models (layers,
+    seeds) do not compare in size. Training images are those of the pass's last batches, about ``n_images`` of
+    them, judged by the same model as the held-out ones.
 
     Args:
-        n_images: Most training images a replica to judge, >= 1.
+        n_images: Training images a replica to judge, >= 1; whole batches, so that there may be a few more.
     """
 
     def __init__(self, n_images: int = 1000) -> None:
-        require_count("n_images", n_images)
         self.n_images = n_images
-        self._train: list[Tensor] = []
+        self._train = LastImages(n_images)
         self._heldout: list[tuple[Tensor, int]] = []
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Forget the last pass."""
-        self._train = []
+        self._train.clear()
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Keep the visible states of the last batches, as many as asked for."""
-        self._train.append(required(outputs, "positive", self).v[..., : self.n_images, :])
-        while sum(v.shape[-2] for v in self._train[1:]) >= self.n_images:
-            self._train.pop(0)
+        self._train.add(required(outputs, "positive", self).v)
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start a new mean."""
@@ -58,10 +56,11 @@ class FreeEnergyGap(pl.Callback):
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Judge the training images by the same model."""
-        if not self._train or not self._heldout:
+        images = self._train.images()
+        if images is None or not self._heldout:
             return
         heldout = sum(total for total, _ in self._heldout) / sum(n for _, n in self._heldout)
-        train = _free_energy(pl_module, torch.cat(self._train, dim=-2)).mean(-1)
+        train = _free_energy(pl_module, images).mean(-1)
         log_scalars(
             pl_module,
             {"free_energy_train": train, "free_energy_heldout": heldout, "free_energy_gap": heldout - train},

@@ -1,4 +1,4 @@
-"""Receptive fields and samples as pictures in TensorBoard."""
+"""Receptive fields, samples and chains as pictures in TensorBoard."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, tensorboards
+from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, required, tensorboards
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.samplers.gibbs import random_visible, sweep
@@ -40,8 +40,8 @@ class Pictures(EveryIterations):
         self.n_pictures = n_pictures
 
     @abstractmethod
-    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
-        """Inputs to draw, ``(*replicas, n, n_visible)``."""
+    def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
+        """Inputs to draw, ``(*replicas, n, n_visible)``, given the outputs of the pass's last step."""
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Draw the grid."""
@@ -49,7 +49,7 @@ class Pictures(EveryIterations):
         layout: Layout | None = getattr(getattr(trainer, "datamodule", None), "pixel_layout", None)
         if not boards or layout is None:
             return
-        tiles = self.tiles(pl_module)
+        tiles = self.tiles(pl_module, outputs)
         first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
         grid = picture_grid(layout.to_picture(first_replica).cpu().numpy())
         for board in boards:
@@ -70,7 +70,7 @@ class ReceptiveFields(Pictures):
     def __init__(self, every: int = 10, n_units: int = 64) -> None:
         super().__init__("receptive_fields", every, n_units)
 
-    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
+    def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
         """Weights of the layer in training times those below."""
         fields: Tensor = rbm_of(pl_module).weight
         dbn: Any = getattr(pl_module, "dbn", None)
@@ -99,14 +99,42 @@ class ModelSamples(Pictures):
         self.n_sweeps = n_sweeps
         self.seed = seed
 
-    def tiles(self, pl_module: pl.LightningModule) -> Tensor:
+    def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
         """Run the chains and project them down to the inputs."""
         rbm = rbm_of(pl_module)
         generator = rng.stream(self.seed, "evaluation")
         v = random_visible(rbm, self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
             v = sweep(rbm, v, generator=generator)
-        v = rbm.visible_mean(rbm.hidden_mean(v))
-        images_of = getattr(pl_module, "images_of", None)
-        images: Tensor = v if images_of is None else images_of(v)
-        return images
+        return _images(pl_module, rbm.visible_mean(rbm.hidden_mean(v)))
+
+
+class ChainPictures(Pictures):
+    """Draws the negative phase that training followed: its configurations' visible units, projected to the inputs.
+
+    Beside :class:`ModelSamples`, whose chains start afresh, it shows where the sampler is: near the data (CD), in
+    one mode, or all over the model. Weighted configurations come in the order of their weights.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        n_chains: Most configurations to draw, >= 1.
+    """
+
+    def __init__(self, every: int = 10, n_chains: int = 64) -> None:
+        super().__init__("chains", every, n_chains)
+
+    def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
+        """The last update's configurations."""
+        negative = required(outputs, "negative", self)
+        v: Tensor = negative.v
+        if negative.weight is not None:
+            n_drawn = min(self.n_pictures, v.shape[-2])
+            v = v.take_along_dim(negative.weight.topk(n_drawn, dim=-1).indices.unsqueeze(-1), dim=-2)
+        return _images(pl_module, v)
+
+
+def _images(module: pl.LightningModule, v: Tensor) -> Tensor:
+    """Inputs that visible states stand for."""
+    images_of = getattr(module, "images_of", None)
+    images: Tensor = v if images_of is None else images_of(v)
+    return images

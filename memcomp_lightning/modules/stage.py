@@ -25,11 +25,11 @@ class DivergedError(ValueError):
     """Training left the finite numbers; which tensor, where, and what to do."""
 
 
-def diverged_parameter(module: nn.Module) -> str | None:
-    """Say which parameter left the finite numbers, and how far; None if none did."""
+def diverged_parameter(module: nn.Module, largest_allowed: float = LARGEST_WEIGHT) -> str | None:
+    """Say which parameter left the allowed numbers, and how far; None if none did."""
     for name, parameter in module.named_parameters():
         largest = float(parameter.detach().abs().max())
-        if not largest <= LARGEST_WEIGHT:
+        if not largest <= largest_allowed:
             return f"{name} has an entry of {largest:g}"
     return None
 

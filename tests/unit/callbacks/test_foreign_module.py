@@ -6,14 +6,15 @@ from typing import Any
 import lightning.pytorch as pl
 import pytest
 import torch
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.utils.data import DataLoader, TensorDataset
+from foreign import IMAGES, PREFIX, TheirChains, TheirRBM, events_in, fit, tensorboard
+from lightning.pytorch.loggers import CSVLogger
 
-from memcomp_lightning import rng
 from memcomp_lightning.callbacks import (
+    ChainPictures,
     ClassificationMetrics,
+    EnergyHistograms,
     FreeEnergyGap,
+    GradientBias,
     HyperParameters,
     ModelSamples,
     MomentumSchedule,
@@ -22,94 +23,35 @@ from memcomp_lightning.callbacks import (
     ParameterHistograms,
     ReceptiveFields,
     ReconstructionError,
+    SamplerDiagnostics,
+    SaturationGuard,
     StageProgressBar,
+    StageTimes,
+    TrajectoryFigure,
 )
 from memcomp_lightning.callbacks.base import rbm_of
-from memcomp_lightning.data import PixelLayout
-from memcomp_lightning.models import RBM, Gaussian
-from memcomp_lightning.modules import Score
-from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import CD, positive_phase
-
-PREFIX = "TheirRBM"
-
-
-class TheirRBM(pl.LightningModule):
-    """Somebody else's module: automatic optimisation, torch's own loaders, the documented protocol."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rbm = RBM(6, 5, weight_init=Gaussian(std=0.3))
-        self.their_generator = rng.stream(1, "theirs")
-
-    def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
-        v = batch[0]
-        positive = positive_phase(self.rbm, v)
-        sampler = CD(k=1)
-        state = sampler.init(self.rbm, len(v), generator=self.their_generator)
-        negative = sampler.sample(self.rbm, state, positive, generator=self.their_generator)
-        gap = contrast(self.rbm, positive, negative.configurations)
-        score = Score(gap.detach(), torch.tensor(3), len(v))
-        return {
-            "loss": gap,
-            "contrast": gap.detach(),
-            "positive": positive,
-            "negative": negative.configurations,
-            "info": {"temperature": torch.tensor(1.0)},
-            "score": score,
-        }
-
-    def validation_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
-        return {"v": batch[0], "score": Score(torch.tensor(2.0), torch.tensor(1), len(batch[0]))}
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), lr=0.1, momentum=0.9)
-
-
-class TheirData(pl.LightningDataModule):
-    pixel_layout = PixelLayout(2, 3)
-
-    def _loader(self) -> DataLoader[Any]:
-        return DataLoader(TensorDataset(rng.uniform((17, 6), generator=rng.stream(0, "data"))), batch_size=5)
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        return self._loader()
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        return self._loader()
 
 
 def all_callbacks() -> list[pl.Callback]:
     return [
+        StageTimes(),
         ReconstructionError(),
         FreeEnergyGap(n_images=7),
         NegativePhaseEnergies(),
+        SamplerDiagnostics(),
+        EnergyHistograms(every=1),
+        GradientBias(every=1),
         OptimizerMonitor(),
         ParameterHistograms(every=1),
         ReceptiveFields(every=1, n_units=4),
         ModelSamples(every=1, n_samples=4, n_sweeps=3),
+        ChainPictures(every=1, n_chains=4),
+        TrajectoryFigure(every=1),
+        SaturationGuard(),
         ClassificationMetrics(),
         HyperParameters({"model": {"n_hidden": 5}}, metrics=[f"{PREFIX}/reconstruction_error", "not_logged"]),
         StageProgressBar(),
     ]
-
-
-def fit(folder: Path, callbacks: list[pl.Callback], logger: Any) -> tuple[TheirRBM, pl.Trainer]:
-    module = TheirRBM()
-    trainer = pl.Trainer(
-        max_epochs=3,
-        accelerator="cpu",
-        logger=logger,
-        callbacks=callbacks,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=any(isinstance(callback, StageProgressBar) for callback in callbacks),
-        num_sanity_val_steps=0,
-        log_every_n_steps=1,
-        default_root_dir=folder,
-    )
-    trainer.fit(module, datamodule=TheirData())
-    return module, trainer
 
 
 pytestmark = [
@@ -119,9 +61,8 @@ pytestmark = [
 
 
 def test_tensorboard_holds_everything(tmp_path: Path) -> None:
-    fit(tmp_path, all_callbacks(), TensorBoardLogger(tmp_path, name="", version="", default_hp_metric=False))
-    events = EventAccumulator(str(tmp_path), size_guidance={"images": 0, "scalars": 0, "histograms": 0})
-    events.Reload()
+    fit(tmp_path, all_callbacks(), tensorboard(tmp_path))
+    events = events_in(tmp_path)
     tags = events.Tags()
     scalars = {
         "reconstruction_error",
@@ -133,6 +74,13 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "energy_model_lowest",
         "contrast",
         "negative_phase/temperature",
+        "negative_phase/bits_changed",
+        "negative_phase/autocorrelation_time",
+        "gradient_bias/cosine",
+        "gradient_bias/relative_error",
+        "seconds/training_s",
+        "seconds/validation_s",
+        "seconds/other_s",
         "learning_rate",
         "momentum",
         "loss",
@@ -141,11 +89,12 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "heldout_accuracy",
     }
     assert {f"{PREFIX}/{name}" for name in scalars} <= set(tags["scalars"])
-    assert set(tags["images"]) == {f"{PREFIX}/receptive_fields", f"{PREFIX}/samples"}
+    pictures = {"receptive_fields", "samples", "chains", "energies", "trajectory"}
+    assert set(tags["images"]) == {f"{PREFIX}/{name}" for name in pictures}
     histograms = {"weight", "b", "c", "energies_data", "energies_model"}
     assert {f"{PREFIX}/{name}" for name in histograms} <= set(tags["histograms"])
     assert len(events.Scalars(f"{PREFIX}/reconstruction_error")) == 3
-    assert len(events.Images(f"{PREFIX}/samples")) == 3
+    assert all(len(events.Images(tag)) == 3 for tag in tags["images"])
     assert events.Scalars(f"{PREFIX}/momentum")[0].value == pytest.approx(0.9)
     assert events.Scalars(f"{PREFIX}/accuracy")[0].value == pytest.approx(3 * 4 / 17)
     hparams = [path for path in tmp_path.rglob("events.out.*") if b"n_hidden" in path.read_bytes()]
@@ -154,7 +103,7 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
 
 def test_values_are_what_they_claim(tmp_path: Path) -> None:
     module, trainer = fit(tmp_path, all_callbacks(), False)
-    v = rng.uniform((17, 6), generator=rng.stream(0, "data"))
+    v = IMAGES
     with torch.no_grad():
         rbm, logged = module.rbm, trainer.callback_metrics
         last = v[15:]
@@ -164,13 +113,21 @@ def test_values_are_what_they_claim(tmp_path: Path) -> None:
         assert logged[f"{PREFIX}/free_energy_heldout"] == pytest.approx(float(heldout), rel=1e-5)
         train = rbm.free_energy(v[10:]).mean()  # the last batches that hold at least seven images
         assert logged[f"{PREFIX}/free_energy_train"] == pytest.approx(float(train), rel=1e-5)
+        assert logged[f"{PREFIX}/free_energy_gap"] == pytest.approx(float(heldout - train), rel=1e-4)
 
 
-def test_callbacks_change_no_bit_of_training(tmp_path: Path) -> None:
-    watched, _ = fit(tmp_path, all_callbacks(), CSVLogger(tmp_path, name="csv"))
-    alone, _ = fit(tmp_path, [], False)
+@pytest.mark.parametrize("kind", [TheirRBM, TheirChains])
+@pytest.mark.parametrize("board", [True, False])
+def test_callbacks_change_no_bit_of_training(tmp_path: Path, kind: type[TheirRBM], board: bool) -> None:
+    callbacks = [c for c in all_callbacks() if kind is TheirRBM or not isinstance(c, ClassificationMetrics)]
+    loggers = [CSVLogger(tmp_path, name="csv"), *[tensorboard(tmp_path)] * board]
+    watched, _ = fit(tmp_path, callbacks, loggers, kind())
+    alone, _ = fit(tmp_path, [], False, kind())
     assert all(a.equal(b) for a, b in zip(watched.parameters(), alone.parameters(), strict=True))
-    assert "energy_model" in (tmp_path / "csv/version_0/metrics.csv").read_text()
+    if kind is TheirRBM:
+        written = (tmp_path / "csv/version_0/metrics.csv").read_text()
+        assert "energy_model" in written
+        assert "seconds/training_s" in written
 
 
 def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> None:

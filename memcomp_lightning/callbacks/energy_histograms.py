@@ -1,0 +1,73 @@
+"""Energies of the data against those of the negative phase, as distributions."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+from torch import Tensor
+
+from memcomp_lightning.callbacks.base import (
+    EveryIterations,
+    prefix_of,
+    rbm_of,
+    required,
+    tensorboards,
+    write_figure,
+)
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.objective import shares
+from memcomp_lightning.plotting.histograms import plot_histograms
+
+
+class EnergyHistograms(EveryIterations):
+    """Draws how energies of images and of the negative phase are distributed: TensorBoard histograms, a picture.
+
+    The histograms ``energies_data`` and ``energies_model`` have the same bins, and the picture ``energies`` shows
+    them on top of each other: a well-trained model overlaps the data. Energies E(v, h) are those of the pass's
+    last batch under the updated model, over all replicas; configurations of the negative phase count by their
+    weights.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        n_bins: Bins from the lowest energy to the highest, >= 1.
+    """
+
+    def __init__(self, every: int = 10, n_bins: int = 40) -> None:
+        super().__init__(every)
+        require_count("n_bins", n_bins)
+        self.n_bins = n_bins
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Histograms of the last batch of the pass."""
+        boards = tensorboards(trainer)
+        if not boards:
+            return
+        rbm = rbm_of(pl_module)
+        energies, weights = {}, {}
+        for name, phase in (("data", "positive"), ("model", "negative")):
+            configurations = required(outputs, phase, self)
+            share: Tensor = shares(configurations).double().flatten().cpu()
+            energy: Tensor = rbm.energy(configurations.v, configurations.h).double().flatten().cpu()
+            energies[name] = energy[share > 0].numpy()
+            weights[name] = share[share > 0].numpy() * configurations.v.shape[-2]
+        everything = np.concatenate([*energies.values()])
+        if not np.isfinite(everything).all():
+            return
+        edges = np.histogram_bin_edges(everything, self.n_bins)
+        counts = {name: np.histogram(energies[name], edges, weights=weights[name])[0] for name in energies}
+        for name, values in energies.items():
+            for board in boards:
+                board.add_histogram_raw(
+                    f"{prefix_of(pl_module)}/energies_{name}",
+                    # TensorBoard takes the outer edges from here.
+                    min=edges[0],
+                    max=edges[-1],
+                    num=round(float(counts[name].sum())),
+                    sum=float((weights[name] * values).sum()),
+                    sum_squares=float((weights[name] * values**2).sum()),
+                    bucket_limits=edges[1:].tolist(),
+                    bucket_counts=counts[name].tolist(),
+                    global_step=trainer.global_step,
+                )
+        write_figure(trainer, pl_module, "energies", plot_histograms(edges, counts, xlabel="energy E(v, h)"))

@@ -1,0 +1,85 @@
+"""How far the sampler's gradient is from the exact one."""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks.base import (
+    EveryIterations,
+    log_scalars,
+    rbm_of,
+    require_enumerable,
+    required,
+)
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.samplers import Exact
+from memcomp_lightning.types import Configurations, NoState
+
+MAX_UNITS = 16
+"""Largest smaller layer: 2^16 configurations are held at once."""
+
+
+class GradientBias(EveryIterations):
+    """Logs ``gradient_bias/cosine`` and ``gradient_bias/relative_error`` of the pass's last batch.
+
+    With g the gradient of the contrast of the batch's ``positive`` and ``negative`` configurations, and g* that of
+    ``positive`` and the exact expectation, they are ``g.g* / |g||g*|`` and ``|g - g*| / |g*|``, weights and biases
+    together, means over replicas. The noise of one batch's chains is in them, too: it falls with the number of
+    chains, the bias of the sampler does not. Both are plain gradients, also where training follows another one
+    (centred, with weight decay), at the parameters that the sampler met, before the step; they are taken on a
+    copy, so that ``grad`` of the model is not touched.
+
+    The smaller layer is enumerated, with 2^units times units of the larger layer numbers for each replica.
+
+    Args:
+        every: Passes between two values, >= 1.
+
+    Raises:
+        SettingError: At the start of training, if a smaller layer has more than 16 units.
+    """
+
+    def __init__(self, every: int = 20) -> None:
+        super().__init__(every)
+        self._before: Any = None
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Refuse models too large to enumerate."""
+        require_enumerable(self, pl_module, MAX_UNITS)
+
+    def on_train_batch_start(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Keep the model as the sampler meets it."""
+        if trainer.is_last_batch and self.is_due(trainer, pl_module):
+            self._before = copy.deepcopy(rbm_of(pl_module))
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Compare both gradients."""
+        rbm, self._before = self._before, None
+        if rbm is None:
+            return
+        positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
+        # Enumeration draws nothing; the protocol of samplers asks for a stream.
+        generator = rng.stream(0, "gradient_bias")
+        exact = Exact(max_units=MAX_UNITS).sample(rbm, NoState(), positive, generator=generator).configurations
+        found, wanted = gradient(rbm, positive, negative), gradient(rbm, positive, exact)
+        log_scalars(
+            pl_module,
+            {
+                "gradient_bias/cosine": torch.cosine_similarity(found, wanted, dim=-1),
+                "gradient_bias/relative_error": (found - wanted).norm(dim=-1) / wanted.norm(dim=-1),
+            },
+        )
+
+
+def gradient(rbm: Any, positive: Configurations, negative: Configurations) -> Tensor:
+    """Gradient of the contrast by all parameters end to end, ``(*replicas, n_parameters)``."""
+    parameters = [parameter for parameter in rbm.parameters() if parameter.requires_grad]
+    with torch.enable_grad():
+        gradients = torch.autograd.grad(contrast(rbm, positive, negative).sum(), parameters)
+    return torch.cat([part.flatten(len(rbm.replicas)) for part in gradients], dim=-1)

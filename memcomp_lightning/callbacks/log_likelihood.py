@@ -1,0 +1,151 @@
+"""Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, Literal
+
+import lightning.pytorch as pl
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks.base import (
+    EveryIterations,
+    LastImages,
+    log_scalars,
+    rbm_of,
+    require_enumerable,
+    required,
+)
+from memcomp_lightning.errors import require_choice, require_count
+
+
+class LogLikelihood(EveryIterations):
+    """Logs ``log_likelihood_train``, ``log_likelihood_heldout`` and ``log_z``: nats an image, means over replicas.
+
+    Training images are those of the pass's last batches, about ``n_images`` of them; held-out images are those of
+    a validation at the end of the pass, if there is one. Images that are not 0 or 1 have no likelihood under a
+    Bernoulli model: each intensity is taken as the probability of a 1 and drawn, with a random stream of the
+    callback's own, the same draws each time. In upper layers of a stack the "images" are mean activations, drawn
+    likewise, and the likelihood is that of the layer.
+
+    By annealed importance sampling (Salakhutdinov & Murray 2008), from independent units with the means of the
+    training images, log Z is an estimate that tends to be too small, the likelihood too large;
+    ``log_z_standard_error`` and ``log_z_effective_sample_size``, of ``n_chains``, say how far to trust it.
+
+    Args:
+        every: Passes between two values, >= 1.
+        method: "exact" enumerates the smaller layer; "ais" estimates log Z at any size.
+        n_images: Training images a replica to judge, >= 1.
+        max_units: Largest smaller layer to enumerate, >= 1.
+        n_chains: Chains of AIS, >= 2.
+        n_betas: Steps of AIS, >= 1.
+        seed: Seed of the draws.
+
+    Raises:
+        SettingError: A setting out of range; at the start of training, a layer too large to enumerate.
+    """
+
+    def __init__(
+        self,
+        every: int = 200,
+        method: Literal["exact", "ais"] = "ais",
+        *,
+        n_images: int = 1000,
+        max_units: int = 25,
+        n_chains: int = 100,
+        n_betas: int = 1000,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(every)
+        require_choice("method", method, ("exact", "ais"))
+        require_count("max_units", max_units)
+        require_count("n_chains", n_chains, minimum=2)
+        require_count("n_betas", n_betas)
+        self.method = method
+        self.max_units = max_units
+        self.n_chains = n_chains
+        self.n_betas = n_betas
+        self.seed = seed
+        self._train = LastImages(n_images)
+        self._heldout: list[tuple[Tensor, int]] = []
+        self._judged_at = -1
+        self._bits: Generator | None = None
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Refuse models too large to enumerate."""
+        if self.method == "exact":
+            require_enumerable(self, pl_module, self.max_units)
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Forget the last pass."""
+        self._train.clear()
+        self._heldout = []
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Keep the visible states of the last batches."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if self.is_due(trainer, pl_module):
+            self._train.add(required(outputs, "positive", self).v)
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Start a new sum, and the draws of the same bits as before."""
+        self._heldout = []
+        self._judged_at = trainer.global_step
+        self._bits = rng.stream(self.seed, "log_likelihood", 1)
+
+    @torch.no_grad()
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Unnormalised log-likelihood of one chunk of held-out images."""
+        if self.is_due(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
+            v = required(outputs, "v", self)
+            self._heldout.append((self._total(rbm_of(pl_module), v, self._bits), v.shape[-2]))
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Normalise."""
+        rbm = rbm_of(pl_module)
+        train = self._train.images()
+        values = self._partition_function(rbm, train)
+        log_z = values["log_z"]
+        if train is not None:
+            total = self._total(rbm, train, rng.stream(self.seed, "log_likelihood", 0))
+            values["log_likelihood_train"] = total / train.shape[-2] - log_z
+        # A validation in the middle of the pass has judged another model.
+        if self._heldout and self._judged_at == trainer.global_step:
+            n_images = sum(n for _, n in self._heldout)
+            values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
+        log_scalars(pl_module, values)
+
+    def _partition_function(self, rbm: Any, train: Tensor | None) -> dict[str, Tensor]:
+        """``log_z`` and, where it is an estimate, how good it is."""
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
+
+        if self.method == "exact":
+            return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
+        ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
+        base = None if train is None else likelihood.base_of(train)
+        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
+        return {
+            "log_z": estimate.log_z,
+            "log_z_standard_error": estimate.standard_error,
+            "log_z_effective_sample_size": estimate.effective_sample_size,
+        }
+
+    @staticmethod
+    def _total(rbm: Any, v: Tensor, bits: Generator) -> Tensor:
+        """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
+        likelihood: Any = import_module("memcomp_lightning.likelihood")
+
+        log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
+        total: Tensor = likelihood.log_likelihood(rbm, rng.bernoulli(v, generator=bits), log_z).double().sum(-1)
+        return total

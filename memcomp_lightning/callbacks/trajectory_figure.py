@@ -1,0 +1,68 @@
+"""The path of a memcomputing machine that solves the model in training, as a figure in TensorBoard."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks.base import EveryIterations, rbm_of, tensorboards, write_figure
+from memcomp_lightning.dmm import DmmSolver, Recording
+from memcomp_lightning.errors import require
+from memcomp_lightning.plotting.trajectory import plot_trajectory
+from memcomp_lightning.qubo import Qubo, QuboSolver, from_model
+
+
+class TrajectoryFigure(EveryIterations):
+    """Lets a machine look for the ground state of the first replica, and draws ``trajectory``.
+
+    The picture is that of Manukian et al. 2019, Fig. 2, by :func:`memcomp_lightning.plotting.plot_trajectory`. The
+    machine has a random stream of its own and the same start each time, so that pictures compare, and runs on the
+    CPU; training does not see it. A large model costs seconds a picture; without TensorBoard nothing is solved.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        solver: Records its trajectory; None is ``DmmSolver(n_restarts=3, record=Recording(every=1))``.
+        last: Restarts in the large panel, >= 1.
+        seed: Seed of the machine's start.
+
+    Raises:
+        SettingError: The solver records no trajectory.
+    """
+
+    def __init__(self, every: int = 100, solver: QuboSolver | None = None, last: int = 3, seed: int = 0) -> None:
+        super().__init__(every)
+        self.solver = DmmSolver(n_restarts=3, record=Recording(every=1)) if solver is None else solver
+        require(
+            getattr(self.solver, "record", None) is not None,
+            "solver",
+            type(self.solver).__name__,
+            "a solver that records its trajectory, for TrajectoryFigure",
+            "Use DmmSolver(record=Recording(every=1)).",
+        )
+        self.last = last
+        self.seed = seed
+
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+        """Solve, and draw."""
+        if not tensorboards(trainer):
+            return
+        problem = _first(from_model(rbm_of(pl_module)))
+        solution = self.solver.minimise(problem, generator=rng.stream(self.seed, "trajectory"))
+        if solution.trajectory is None:
+            raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")
+        title = f"lowest energy {solution.best_energy.item():.4g}"
+        write_figure(
+            trainer, pl_module, "trajectory", plot_trajectory(solution.trajectory, last=self.last, title=title)
+        )
+
+
+def _first(problem: Qubo) -> Qubo:
+    """The first of the problems, on the CPU."""
+    n_axes = len(problem.problems)
+
+    def first(tensor: Tensor) -> Tensor:
+        return tensor.flatten(0, n_axes - 1)[0].cpu() if n_axes else tensor.cpu()
+
+    return Qubo(problem.graph, first(problem.coupling), first(problem.linear), first(problem.offset))

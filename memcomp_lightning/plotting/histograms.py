@@ -1,0 +1,54 @@
+"""Histograms of one quantity on top of each other."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from memcomp_lightning.errors import require
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; they differ in lightness, too.
+_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
+
+
+def plot_histograms(
+    edges: NDArray[np.floating],
+    counts: Mapping[str, NDArray[np.floating]],
+    *,
+    xlabel: str = "",
+    title: str = "",
+    width: float = 4.2,
+    height: float = 2.6,
+) -> Figure:
+    """Shares of values by bin, a filled step curve for each name.
+
+    Args:
+        edges: ``(n_bins + 1,)``, rising.
+        counts: Counts or weights of each bin by name, ``(n_bins,)`` each, at most four names; each set is drawn
+            as shares of its sum.
+        xlabel: Name of the quantity.
+        title: Printed above.
+        width: Inches.
+        height: Inches.
+
+    Returns:
+        A figure of its own, which pyplot does not know.
+
+    Raises:
+        SettingError: There are no sets of counts, or too many.
+    """
+    allowed = f"1 to {len(_COLOURS)} sets of counts"
+    require(1 <= len(counts) <= len(_COLOURS), "counts", sorted(counts), allowed)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.add_subplot()
+    for colour, (name, values) in zip(_COLOURS, counts.items(), strict=False):
+        axes.stairs(values / values.sum(), edges, fill=True, color=colour, alpha=0.35)
+        axes.stairs(values / values.sum(), edges, color=colour, linewidth=1.1, label=name)
+    axes.set(xlabel=xlabel, ylabel="share")
+    axes.set_ylim(bottom=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize="small")
+    if title:
+        axes.set_title(title, fontsize="medium", loc="left")
+    return figure
