@@ -1,5 +1,6 @@
 """How likely data are under an RBM: log Z by enumeration or annealing, and what follows from it."""
 
+from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, base_of
 from memcomp_lightning.likelihood.exact import (
     exact_samples,
     kl_divergence,
@@ -9,6 +10,10 @@ from memcomp_lightning.likelihood.exact import (
 )
 
 __all__ = [
+    "Ais",
+    "AisEstimate",
+    "ReverseAis",
+    "base_of",
     "exact_samples",
     "kl_divergence",
     "log_likelihood",

@@ -38,14 +38,11 @@ def prepare(one: Layers, n_second: int) -> Prepared:
     """Sort the units of the other layer into packs, tabulate what depends on u."""
     weight, bias, other = (x.numpy() for x in one[:3])
     n_first = weight.shape[1] - n_second
-    halves = weight[:, :n_first], weight[:, n_first:]
-    highest, lowest = (
-        np.stack([half.clip(*limits).sum(1) for half in halves]) for limits in ((0, None), (None, 0))
-    )
-    highest[0] += other
-    lowest[0] += other
-    most = highest.sum(0)
-    small = np.maximum(most, np.maximum(highest, -lowest).max(0)) <= _LARGEST_LOG
+    # The largest values of A, B and A + B. Where exp(A) vanishes, exp(A + B) < exp(-40) does not matter to 1 + it.
+    of_first = weight[:, :n_first].clip(0).sum(1) + other
+    of_second = weight[:, n_first:].clip(0).sum(1)
+    most = of_first + of_second
+    small = np.maximum(most, np.maximum(of_first, of_second)) <= _LARGEST_LOG
     order, closes = _packs(np.logaddexp(0.0, most), np.flatnonzero(small))
     places = np.where(order[:, None] < 0, 0.0, weight[order])
     # An empty place is a unit that is never on.

@@ -10,15 +10,15 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import cache
 from itertools import product
+from types import ModuleType
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from memcomp_lightning.likelihood import cpu
-from memcomp_lightning.likelihood.kernel import sum_over_second
 from memcomp_lightning.likelihood.layers import Layers, log_weights
 from memcomp_lightning.models.enumeration import binary_states
 
@@ -54,18 +54,17 @@ def prefix_log_weights(
         ``(n_replicas, 2^(n_enumerated - n_second))`` float64 on the model's device.
     """
     n_second = min(N_SECOND, layers.n_enumerated) if n_second is None else n_second
-    compiled = layers.weight.device.type == "cpu" if compiled is None else compiled
+    cpu = _cpu() if compiled or (compiled is None and layers.weight.device.type == "cpu") else None
     n_replicas, n_prefixes = layers.weight.shape[0], 2 ** (layers.n_enumerated - n_second)
     pairs = 2**n_second * layers.n_other
-    together = 1 if compiled else max(1, _REFERENCE_PAIRS // pairs)
+    together = 1 if cpu else max(1, _REFERENCE_PAIRS // pairs)
     if block is None:
-        block = max(1, (_COMPILED_PAIRS if compiled else _REFERENCE_PAIRS // min(together, n_replicas)) // pairs)
+        block = max(1, (_COMPILED_PAIRS if cpu else _REFERENCE_PAIRS // min(together, n_replicas)) // pairs)
     blocks = list(product(_slices(n_replicas, together), _slices(n_prefixes, block)))
     out = torch.empty(n_replicas, n_prefixes, dtype=torch.float64)
-    if compiled:
+    if cpu:
         prepared = [cpu.prepare(layers.part(r), n_second) for r in range(n_replicas)]
-        if not sum_over_second.signatures:
-            cpu.sum_compiled(prepared[0], slice(0, 0))  # compiles once, not on every thread
+        cpu.sum_compiled(prepared[0], slice(0, 0))  # compiles, which is no part of the estimate of the time
 
         def work(at: Block) -> None:
             out[at] = cpu.sum_compiled(prepared[at[0].start], at[1])
@@ -79,9 +78,20 @@ def prefix_log_weights(
             # On the CPU at once: the bar and Ctrl-C then follow the device.
             out[at] = log_weights(layers.part(at[0]), prefixes.unsqueeze(0), second).logsumexp(-1).cpu()
 
-    n_threads = torch.get_num_threads() if compiled else 1
+    n_threads = torch.get_num_threads() if cpu else 1
     _run(blocks, work, n_threads, progress)
     return out.to(layers.weight.device)
+
+
+@cache
+def _cpu() -> ModuleType | None:
+    """The compiled kernel, if it can be loaded."""
+    try:
+        from memcomp_lightning.likelihood import cpu
+    except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
+        log.info("numba: %s. The plain torch program is many times slower; try NUMBA_CACHE_DIR.", error)
+        return None
+    return cpu
 
 
 def _slices(n: int, size: int) -> list[slice]:

@@ -7,6 +7,15 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.data import Digits, ImageDataModule
 from memcomp_lightning.dmm import BondField, DmmSolver, Recording, WarmRestart
+from memcomp_lightning.likelihood import (
+    Ais,
+    ReverseAis,
+    base_of,
+    exact_samples,
+    kl_divergence,
+    log_partition_function,
+    log_pseudo_likelihood,
+)
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
@@ -89,3 +98,18 @@ def test_training_runs_on_the_device() -> None:
         )
         trainer.fit(module, datamodule=data)
     assert evaluate(module.network, data.test_dataloader()).accuracy.shape == (2,)
+
+
+def test_likelihoods_are_the_same_on_both_devices() -> None:
+    answers = []
+    for device in ("cpu", "cuda"):
+        rbm = small_rbm(11, 13, replicas=(3,)).double().to(device)
+        generator = rng.stream(2, "annealing")
+        v = exact_samples(rbm, 31, generator=generator)
+        up = Ais(n_chains=31, n_betas=53).estimate(rbm, generator=generator, base=base_of(v))
+        down = ReverseAis(n_betas=53).estimate(rbm, v, generator=generator)
+        exact = (log_partition_function(rbm), kl_divergence(rbm, v), log_pseudo_likelihood(rbm, v))
+        assert all(part.device.type == device for part in (v, *up, *down, *exact))
+        answers.append([part.cpu() for part in (v, *up, *down, *exact)])
+    for cpu, cuda in zip(*answers, strict=True):
+        torch.testing.assert_close(cuda, cpu)

@@ -19,6 +19,7 @@ from memcomp_lightning.dmm import (
     WarmRestart,
 )
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.likelihood import Ais, ReverseAis
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
 
@@ -36,6 +37,9 @@ REFUSED = [
     (Quench, {"n_chains": 0}, COUNT),
     (Exact, {"max_units": 0}, COUNT),
     (Exact, {"max_units": 21}, "an integer from 1 to 20"),
+    (Ais, {"n_chains": 1}, "an integer >= 2"),
+    *((kind, {name: 0}, COUNT) for kind in (Ais, ReverseAis) for name in ("n_betas", "k")),
+    *((kind, {"betas": (0.0, 0.5)}, "numbers that increase from 0 to 1") for kind in (Ais, ReverseAis)),
     (BruteForce, {"max_variables": 0}, COUNT),
     (BruteForce, {"chunk_size": 0}, COUNT),
     (AlternatingDescent, {"n_restarts": 0}, COUNT),
@@ -172,6 +176,8 @@ KINDS = [
     WarmRestart,
     ClauseField,
     BondField,
+    Ais,
+    ReverseAis,
     *SCHEMES,
 ]
 

@@ -1,0 +1,247 @@
+"""Estimates of log Z by annealed importance sampling, up from an RBM without couplings and back down."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Generator, Tensor
+from tqdm.auto import tqdm
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.rbm import RBM
+
+Schedule = Sequence[float] | Tensor
+
+
+class AisEstimate(NamedTuple):
+    """An estimate of log Z with what it takes to judge it; ``str`` gives a line a replica.
+
+    Attributes:
+        log_z: ``(*replicas,)`` float64.
+        standard_error: Of log Z, by the delta method: standard error of the mean weight over the mean weight. It
+            knows the weights that were drawn: with few effective samples it is too small.
+        effective_sample_size: (sum w)^2 / sum w^2, 1 to n_chains.
+        log_weights: Log importance weight of each chain, without log Z of the base, ``(*replicas, n_chains)``.
+    """
+
+    log_z: Tensor
+    standard_error: Tensor
+    effective_sample_size: Tensor
+    log_weights: Tensor
+
+    def __str__(self) -> str:
+        """One line a replica."""
+        n_chains = self.log_weights.shape[-1]
+        columns = (column.reshape(-1).tolist() for column in self[:3])
+        return "\n".join(
+            f"log Z = {log_z:.4f} +- {error:.2g} ({size:.1f} effective of {n_chains} chains)"
+            for log_z, error, size in zip(*columns, strict=True)
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Ais:
+    r"""Annealed importance sampling from an RBM without couplings (Neal 2001; Salakhutdinov & Murray 2008).
+
+    .. math:: p_\beta(v) \propto exp((1 - \beta) b_0.v + \beta b.v) \prod_i (1 + exp(\beta (W v + c)_i))
+
+    A chain starts at an independent draw at beta = 0 and makes k Gibbs sweeps at each beta in between. The mean
+    weight is Z / Z_0 without bias; log Z is therefore too low on average, and log p(v) too high.
+
+    How many steps suffice is seen in the effective sample size: raise ``n_betas`` until it is a third of the
+    chains and log Z has stopped rising; below, the standard error is too small. For a 784x20 RBM after four epochs
+    of PCD-1 on binary MNIST, with ``base_of`` the images and 100 chains: 300, 1,000, 10,000 steps are 0.39, 0.08,
+    0.05 nats off with 25, 47, 87 effective chains; from a base of zeros it takes ten times as many. For 784x500,
+    trained alike, 60,000 do not suffice: 7 effective chains, log Z 421, 425, 427 after 1,000, 10,000, 60,000.
+
+    Weights are summed in float64. In a float32 model each step's gain is computed as log1p of a small number, not
+    as a difference of softplus sums: 3,000 steps of 784x500 are off by at most 3e-6 nats a chain instead of 3e-3.
+
+    Attributes:
+        n_chains: Chains a replica, >= 2.
+        n_betas: Steps of the linear schedule, >= 1.
+        betas: The schedule itself, increasing from 0 to 1, in place of ``n_betas``; None is linear.
+        k: Gibbs sweeps at each beta, >= 1.
+    """
+
+    n_chains: int = 100
+    n_betas: int = 1000
+    betas: Schedule | None = None
+    k: int = 1
+
+    def __post_init__(self) -> None:
+        require_count("n_chains", self.n_chains, 2)
+        object.__setattr__(self, "betas", _checked(self.n_betas, self.betas, self.k))
+
+    def estimate(
+        self, model: RBM, *, generator: Generator, base: Tensor | None = None, progress: bool = False
+    ) -> AisEstimate:
+        """Estimate log Z.
+
+        Args:
+            model: The RBM, on any device.
+            generator: Random stream.
+            base: Visible bias b_0 of the RBM at beta = 0, ``(n_visible,)`` or ``(*replicas, n_visible)``, see
+                :func:`base_of`; None is zeros.
+            progress: Show a bar.
+
+        Raises:
+            SettingError: base has the wrong shape.
+        """
+        base = _base(model, base)
+        start = torch.sigmoid(base).unsqueeze(-2).expand(*model.replicas, self.n_chains, model.n_visible)
+        v = rng.bernoulli(start, generator=generator)
+        log_w = _anneal(model, v, base, _schedule(self.n_betas, self.betas), self.k, generator, progress)
+        return _summary(_log_z_of_base(model, base), log_w, 1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReverseAis:
+    r"""The path of :class:`Ais` downwards, from samples of the model.
+
+    The mean weight is Z_0 / Z without bias; log Z is therefore too high on average. With ``Ais`` it brackets log Z
+    (Burda et al. 2015; Grosse et al. 2015) - but only if the samples are the model's own: exact ones
+    (``exact_samples``), where the smaller layer can be enumerated. From Markov chains, which never mix to the end,
+    the estimate is no bound any more.
+
+    Attributes:
+        n_betas: Steps of the linear schedule, >= 1.
+        betas: The schedule itself, as that of ``Ais``, increasing from 0 to 1; None is linear.
+        k: Gibbs sweeps at each beta, >= 1.
+    """
+
+    n_betas: int = 1000
+    betas: Schedule | None = None
+    k: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "betas", _checked(self.n_betas, self.betas, self.k))
+
+    def estimate(
+        self,
+        model: RBM,
+        v: Float[Tensor, "*replicas n n_visible"],
+        *,
+        generator: Generator,
+        base: Tensor | None = None,
+        progress: bool = False,
+    ) -> AisEstimate:
+        """Estimate log Z; ``log_weights`` are those of Z_0 / Z.
+
+        Args:
+            model: The RBM.
+            v: Samples of the model in {0, 1}, two or more a replica; each starts a chain.
+            generator: Random stream.
+            base: As that of ``Ais.estimate``.
+            progress: Show a bar.
+
+        Raises:
+            SettingError: v or base has the wrong shape.
+        """
+        fits = v.ndim >= 2 and v.shape[:-2] == model.replicas and v.shape[-1] == model.n_visible
+        allowed = f"{(*model.replicas, 'n', model.n_visible)} with n >= 2"
+        require(fits and v.shape[-2] >= 2, "shape of v", tuple(v.shape), allowed)
+        base = _base(model, base)
+        betas = _schedule(self.n_betas, self.betas)[::-1]
+        log_w = _anneal(model, v.to(model.b), base, betas, self.k, generator, progress)
+        return _summary(_log_z_of_base(model, base), log_w, -1)
+
+
+def base_of(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_visible"]:
+    """Visible bias of the independent units that have the data's means: log (n_on + 1) / (n_off + 1).
+
+    >>> base_of(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
+    tensor([1.0986, 0.0000])
+    """
+    n_on = v.sum(-2)
+    return torch.log((n_on + 1) / (v.shape[-2] - n_on + 1))
+
+
+@torch.no_grad()
+def _anneal(
+    model: RBM,
+    v: Tensor,
+    base: Tensor,
+    betas: Sequence[float],
+    k: int,
+    generator: Generator,
+    progress: bool,
+) -> Tensor:
+    """Log weights of chains that start at v, in equilibrium at the first beta, ``(*replicas, n_chains)``."""
+    log_w = torch.zeros(v.shape[:-1], dtype=torch.float64, device=v.device)
+    bias_gain = (model.b - base).unsqueeze(-1)
+    base = base.unsqueeze(-2)
+    field = model.hidden_field(v)
+    for beta, target in tqdm(list(pairwise(betas)), desc="annealing", disable=not progress):
+        log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double() + _softplus_gain(field, beta, target)
+        if target != betas[-1]:
+            for _ in range(k):
+                h = _draw(field.mul_(target).sigmoid_(), generator)
+                v = _draw(model.visible_field(h).mul_(target).add_(base, alpha=1 - target).sigmoid_(), generator)
+                field = model.hidden_field(v)
+    return log_w
+
+
+def _softplus_gain(field: Tensor, beta: float, target: float) -> Tensor:
+    r"""Sum over the units of softplus(target x) - softplus(beta x), ``(*replicas, n_chains)`` float64.
+
+    From low to high a unit gains (high - low) max(x, 0) + log1p(sigmoid(-low |x|) expm1(-(high - low) |x|)): no
+    difference of large numbers, no overflow, the argument of log1p in [-1/2, 0].
+    """
+    low, high = min(beta, target), max(beta, target)
+    size = field.abs()
+    linear = (high - low) / 2 * (field.sum(-1).double() + size.sum(-1).double())
+    fall = size.mul(low - high).expm1_().mul_(size.mul_(-low).sigmoid_()).log1p_().sum(-1).double()
+    return (linear + fall) * (1 if target > beta else -1)
+
+
+def _draw(probability: Tensor, generator: Generator) -> Tensor:
+    """``rng.bernoulli``, with one pass and one tensor less."""
+    return rng.uniform(probability.shape, generator=generator, like=probability).lt_(probability)
+
+
+def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
+    """Estimate from weights whose mean is (Z / Z_0)^sign."""
+    n = log_w.shape[-1]
+    w = torch.exp(log_w - log_w.amax(-1, keepdim=True))
+    log_mean = w.mean(-1).log() + log_w.amax(-1)
+    error = w.std(-1) / (w.mean(-1) * n**0.5)
+    return AisEstimate(log_z_of_base + sign * log_mean, error, w.sum(-1).square() / w.square().sum(-1), log_w)
+
+
+def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
+    """Log of Z_0 = 2^n_hidden prod_j (1 + exp(b_0j)), ``(*replicas,)`` float64."""
+    log_two = torch.log(torch.tensor(2.0, dtype=torch.float64, device=base.device))
+    return model.n_hidden * log_two + F.softplus(base.double(), threshold=40.0).sum(-1)
+
+
+def _base(model: RBM, base: Tensor | None) -> Tensor:
+    """The base's bias for each replica."""
+    shape = model.b.shape
+    if base is None:
+        return torch.zeros_like(model.b, requires_grad=False)
+    fits = base.shape in (shape, shape[-1:])
+    require(fits, "shape of base", tuple(base.shape), f"{tuple(shape[-1:])} or {tuple(shape)}")
+    return base.detach().to(model.b).expand(shape)
+
+
+def _checked(n_betas: int, betas: Schedule | None, k: int) -> tuple[float, ...] | None:
+    """Check the settings that both directions share; return the schedule as numbers."""
+    require_count("n_betas", n_betas)
+    require_count("k", k)
+    if betas is None:
+        return None
+    values = tuple(float(beta) for beta in betas)
+    increasing = len(values) >= 2 and all(low < high for low, high in pairwise(values))
+    rises = increasing and values[0] == 0.0 and values[-1] == 1.0
+    require(rises, "betas", betas, "numbers that increase from 0 to 1, both among them")
+    return values
+
+
+def _schedule(n_betas: int, betas: Schedule | None) -> list[float]:
+    return [step / n_betas for step in range(n_betas + 1)] if betas is None else [float(beta) for beta in betas]
