@@ -1,11 +1,12 @@
 """Likelihoods as torchmetrics: sums over batches and processes, one value for each replica."""
 
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
+
+from memcomp_lightning.likelihood import log_likelihood, log_pseudo_likelihood
 
 
 class _MeanOverImages(Metric):
@@ -49,9 +50,7 @@ class MeanLogLikelihood(_MeanOverImages):
             v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
             log_z: Logarithm of the model's partition function, ``(*replicas,)``.
         """
-        likelihood: Any = import_module("memcomp_lightning.likelihood")
-
-        self._add(likelihood.log_likelihood(model, v, log_z))
+        self._add(log_likelihood(model, v, log_z))
 
 
 class MeanLogPseudoLikelihood(_MeanOverImages):
@@ -70,6 +69,4 @@ class MeanLogPseudoLikelihood(_MeanOverImages):
             model: The energy model.
             v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
         """
-        likelihood: Any = import_module("memcomp_lightning.likelihood")
-
-        self._add(likelihood.log_pseudo_likelihood(model, v).sum(-1))
+        self._add(log_pseudo_likelihood(model, v).sum(-1))

@@ -1,14 +1,13 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning import rng
+from memcomp_lightning import likelihood, rng
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
     LastImages,
@@ -128,8 +127,6 @@ class LogLikelihood(EveryIterations):
 
     def _partition_function(self, rbm: Any, train: Tensor | None) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
-        likelihood: Any = import_module("memcomp_lightning.likelihood")
-
         if self.method == "exact":
             return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
@@ -144,8 +141,6 @@ class LogLikelihood(EveryIterations):
     @staticmethod
     def _total(rbm: Any, v: Tensor, bits: Generator) -> Tensor:
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
-        likelihood: Any = import_module("memcomp_lightning.likelihood")
-
         log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
         total: Tensor = likelihood.log_likelihood(rbm, rng.bernoulli(v, generator=bits), log_z).double().sum(-1)
         return total

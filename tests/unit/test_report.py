@@ -143,9 +143,9 @@ def test_gap_holds_only_without_the_control_that_reaches_it(tmp_path):
 
 
 def test_fewer_iterations_are_none_where_no_iteration_is_needed(tmp_path):
-    def measured(folder, *more, first=0.8):
-        lengths = [record("mem", first, 1), record("mem", 0.8, 5)]
-        return verdicts(results(tmp_path / folder, record("cd", 0.5), *lengths, *more))[0]
+    def measured(folder, *more, first=0.8, cd_first=0.4):
+        lengths = [record("mem", first, 1), record("mem", 0.8, 5), record("cd", cd_first, 1), record("cd", 0.5)]
+        return verdicts(results(tmp_path / folder, *lengths, *more))[0]
 
     saved = measured("a")
     assert (saved.measured, saved.verdict) == ("N = 1 instead of 5 for 0.500", HOLDS)
@@ -153,6 +153,8 @@ def test_fewer_iterations_are_none_where_no_iteration_is_needed(tmp_path):
     free = measured("c", record("free", 0.6, 0))
     assert free[-2:] == ("holds only without controls", ("no pretraining",))
     assert measured("d", record("free", 0.4, 0)).verdict == HOLDS
+    useless = measured("e", cd_first=0.5)
+    assert useless[1:4] == ("CD-1: 0.500 at N = 5, no more than at N = 1", "", "does not hold")
 
 
 def test_a_claim_has_controls_of_its_own(tmp_path):

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+import lightning.pytorch as pl
 import pytest
 import torch
-from test_foreign_module import TheirData, TheirRBM, pl
+from foreign import TheirData, TheirRBM
 
 from memcomp_lightning.callbacks import LearningRateDecay
 from memcomp_lightning.errors import SettingError
