@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from memcomp_lightning.report.comparison import signed
 from memcomp_lightning.report.results import Claim, Results
-from memcomp_lightning.report.verdicts import horizontal_arrow, vertical_arrow
+from memcomp_lightning.report.verdicts import gains_by_pretraining, horizontal_arrow, vertical_arrow
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "0.25", "0.55")
@@ -147,7 +147,7 @@ def _arrows(axes: Axes, results: Results, claim: Claim, passes: int, *, column: 
     gap = signed(vertical_arrow(results, claim, passes).effect)
     axes.annotate(gap, xy=(x + 0.6, (low + high) / 2), va="center", size=8, annotation_clip=False)
     saved = horizontal_arrow(results, claim, passes)
-    if saved is not None and saved[0] < saved[1]:
+    if saved is not None and saved[0] < saved[1] and gains_by_pretraining(results, claim, passes):
         axes.annotate("", xy=(saved[0], low), xytext=(saved[1], low), arrowprops={**style, "arrowstyle": "->"})
         axes.annotate(
             f"{saved[1] - saved[0]} iterations",

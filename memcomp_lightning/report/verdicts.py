@@ -57,6 +57,14 @@ def horizontal_arrow(results: Results, claim: Claim, passes: int) -> tuple[int, 
     return next(((n, last) for n in lengths if results.point(claim.better, n, passes).mean >= goal), None)
 
 
+def gains_by_pretraining(results: Results, claim: Claim, passes: int) -> bool:
+    """Whether the other curve is better at its last N than at its first; if not, iterations saved say nothing."""
+    lengths = results.lengths(claim.than)
+    last, first = (results.values(claim.than, n, passes) for n in (lengths[-1], lengths[0]))
+    gain = compare(last, first)
+    return gain.effect > 0 and not gain.p >= 0.05
+
+
 def vertical_arrow(results: Results, claim: Claim, passes: int) -> Comparison:
     """Accuracy of the better curve less that of the other one, each at its last N."""
     return compare(_at_last(results, claim.better, passes), _at_last(results, claim.than, passes))
@@ -77,13 +85,11 @@ def _needs_fewer_iterations(results: Results, claim: Claim, passes: int) -> Verd
     names, lengths = results.plan.labels, results.lengths(claim.than)
     arrow, last = horizontal_arrow(results, claim, passes), lengths[-1]
     goal = results.point(claim.than, last, passes).mean
-    gained = compare(results.values(claim.than, last, passes), results.values(claim.than, lengths[0], passes))
     untrained = [curve for curve in results.plan.controls(claim) if results.lengths(curve) == [0]]
     free = [curve for curve in untrained if results.point(curve, 0, passes).mean >= goal]
     measured = f"N = {arrow[0]} instead of {last} for {goal:.3f}" if arrow else f"never {goal:.3f}"
     holds = arrow is not None and arrow[0] < arrow[1]
-    if gained.effect <= 0 or gained.p >= 0.05:
-        # Then it needs none itself, and the place of the arrow is chance.
+    if not gains_by_pretraining(results, claim, passes):
         measured, holds = f"{names[claim.than]}: {goal:.3f} at N = {last}, no more than at N = {lengths[0]}", False
     claimed = f"{names[claim.better]} needs fewer pretraining iterations than {names[claim.than]}"
     return Verdict(f"{claimed} (after {passes} passes)", measured, "", *_verdict(results, holds, free))
