@@ -1,7 +1,6 @@
 """``memcomp-report``: figures, tables and verdicts from run folders of ``experiment=figure4`` and the like."""
 
 import argparse
-import csv
 import io
 import json
 from collections.abc import Sequence
@@ -13,11 +12,12 @@ from torch.utils.tensorboard import SummaryWriter
 
 from memcomp_lightning.cli.errors import UserError, refuse
 from memcomp_lightning.cli.table import aligned, short_path
+from memcomp_lightning.cli.worth_report import write_worth
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import write_text, written_whole
-from memcomp_lightning.plotting import plot_against_iterations, plot_against_passes, plot_controls, plot_worth
+from memcomp_lightning.plotting import plot_against_iterations, plot_against_passes, plot_controls
 from memcomp_lightning.report import Section, Verdict, markdown, page, read_results, verdicts
-from memcomp_lightning.report.worth import WORTH_RULE, read_worth, worth_table, worth_verdicts
+from memcomp_lightning.report.worth import read_worth
 
 COMMAND = "memcomp-report"
 
@@ -57,16 +57,9 @@ def _report_worth(folder: Path) -> Section:
     worth = read_worth(folder)
     if not worth.data_sets:
         raise UserError(f"{folder} has no courses yet: go on with memcomp-train resume={folder}")
-    table = worth_table(worth)
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(table)
-    write_text(folder / "sampler_worth.csv", buffer.getvalue())
-    judged = worth_verdicts(worth)
-    write_text(folder / "verdicts.md", markdown(judged))
-    figures = {name: plot_worth(worth, name) for name in worth.data_sets}
+    figures, judged, notes = write_worth(worth, folder)
     pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
-    notes = [*_origin(folder), WORTH_RULE, "Numbers: sampler_worth.csv"]
-    return Section(worth.plan["title"], pictures, judged, notes)
+    return Section(worth.plan["title"], pictures, judged, [*_origin(folder), *notes])
 
 
 def save(folder: Path, name: str, figure: Figure) -> bytes:
