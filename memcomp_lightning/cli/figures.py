@@ -31,6 +31,8 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
     with runner(config.figure.workers, config.trainer.accelerator, run_unit) as run:
         for choosing in (True, False):
             units = plan_units(config, composed, records, choosing=choosing)
+            if not units:
+                continue
             with tqdm(total=sum(unit.n_updates for unit in units), unit="update", unit_scale=True) as bar:
                 bar.set_description(config.figure.name)
 

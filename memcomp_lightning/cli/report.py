@@ -44,8 +44,11 @@ def report(folder: Path) -> Section:
     write_text(folder / f"{name}.csv", results.table())
     judged = verdicts(results)
     write_text(folder / "verdicts.md", markdown(judged))
-    plot = plot_against_passes if results.plan.against == "passes" else plot_against_iterations
-    figures = {name: plot(results), f"{name}_controls": plot_controls(results)}
+    figures = {f"{name}_controls": plot_controls(results)}
+    if results.plan.against == "passes":
+        figures = {name: plot_against_passes(results), **figures}
+    elif any(len(results.lengths(curve)) > 1 for curve in results.curves):
+        figures = {name: plot_against_iterations(results), **figures}
     pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
     time = f"Training took {results.seconds / 60:.1f} min of one core."
     notes = [*_origin(folder), time, f"Numbers: {name}.csv"]

@@ -1,5 +1,6 @@
 """``experiment=sampler_worth``: RBMs trained by many samplers, measured by their likelihood along the way."""
 
+import copy
 import json
 import math
 import time
@@ -23,6 +24,7 @@ from memcomp_lightning.files import write_text
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules import DBNPretraining, DivergedError
+from memcomp_lightning.modules.stage import LARGEST_WEIGHT
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.replicas import Pass, pretrain_layer, stacked
 from memcomp_lightning.report.worth import Course, Courses
@@ -188,7 +190,8 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
             progress(f"{job.title}, update {done.number} of {job.points[-1]}", done.number - reported)
             reported = done.number
             cosine, error = gradient_bias(dbn[0], module, done, job.gradient_draws)
-            score = torch.nan_to_num(measure(dbn[0]).double(), nan=math.inf)
+            rbm, diverged = without_diverged(dbn[0])
+            score = measure(rbm).double().masked_fill(diverged, math.inf)
             course.updates.append(done.number * updates_a_pass)
             course.seconds.append(seconds)
             course.scores.append(score.tolist())
@@ -198,6 +201,18 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
     except DivergedError:
         pass  # Found after the last measurement, which says it.
     return [course]
+
+
+@torch.no_grad()
+def without_diverged(rbm: RBM) -> tuple[RBM, Tensor]:
+    """A copy in which replicas that left the finite numbers are zero, and which they are, ``(*replicas,)``."""
+    n = len(rbm.replicas)
+    largest = torch.stack([p.flatten(n).abs().amax(-1).nan_to_num(nan=math.inf) for p in rbm.parameters()]).amax(0)
+    diverged = largest > LARGEST_WEIGHT
+    kept = copy.deepcopy(rbm)
+    for parameter in kept.parameters():
+        parameter.masked_fill_(diverged.view((*diverged.shape, *[1] * (parameter.ndim - n))), 0.0)
+    return kept, diverged
 
 
 @torch.no_grad()

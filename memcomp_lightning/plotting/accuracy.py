@@ -94,10 +94,10 @@ def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
     for axes, done in zip(panels, passes, strict=True):
         for row, curve in zip(rows, curves, strict=True):
             point = results.point(curve, results.lengths(curve)[-1], done)
-            colour = _COLOURS[claimed.index(curve)] if curve in claimed else "0.35"
+            colour = _COLOURS[claimed.index(curve) % len(_COLOURS)] if curve in claimed else "0.35"
             error = None if math.isnan(point.error) else 2 * point.error
             axes.errorbar(point.mean, row, xerr=error, fmt="o", ms=4, color=colour, capsize=2)
-            if curve in claimed:
+            if curve in claimed[:2]:
                 axes.axvline(point.mean, color=colour, lw=0.7, alpha=0.6)
         axes.set_title(f"{done} passes", size=9)
         axes.grid(alpha=0.25, axis="x")

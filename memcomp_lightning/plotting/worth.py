@@ -42,8 +42,7 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
     by_time.set(xlabel=f"seconds of {worth.plan['replicas'] + worth.plan['choosing']} replicas", xscale="log")
     bias.set(xlabel="updates", ylabel="cosine of the mean gradient with the exact one", xscale="log")
     for axes in (by_update, by_time):
-        _finite_range(axes)
-        if settings["measure"] == "kl":
+        if _finite_range(axes) and settings["measure"] == "kl":
             axes.set_yscale("log")
     for axes in (by_update, by_time, bias):
         axes.grid(alpha=0.25)
@@ -54,11 +53,12 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
     return figure
 
 
-def _finite_range(axes: Axes) -> None:
-    """Leave out what diverged: the range is that of the finite values up to twice the first one."""
+def _finite_range(axes: Axes) -> bool:
+    """Leave out what diverged: from the lowest value to a little above the first; say whether any is finite."""
     values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
     values = values[np.isfinite(values) & (values > 0)]
     if values.size:
         first = float(np.median([np.asarray(line.get_ydata(), dtype=float)[0] for line in axes.get_lines()]))
         top = 1.3 * first if math.isfinite(first) else float(values.max())
         axes.set_ylim(float(values.min()) / 1.1, max(top, float(values.min()) * 1.1))
+    return bool(values.size)

@@ -243,6 +243,16 @@ def test_all_figures_end_in_one_report(memcomp_train: Run) -> None:
     assert [len(record.scores["test_loss"][0]) for record in records("run/figure4").of("cd1")] == [3, 3]
 
 
+def test_other_readings_of_the_paper_in_one_table(memcomp_train: Run) -> None:
+    outcome = memcomp_train("experiment=readings", *TINY, "figure.iterations=[2]")
+    assert outcome.status == 0, outcome.err
+    assert "Mem-QUBO, binary inputs is above CD-1, binary inputs at N = 2 (after 2 passes)" in outcome.out
+    assert not Path("run/readings.png").exists()  # one pretraining length is no curve
+    assert Path("run/readings_controls.png").stat().st_size > 0
+    losses = {record.curve: record.scores["test_loss"][1][0] for record in records().all}
+    assert len(set(losses.values())) == len(losses) == 17  # every setting does something
+
+
 def test_report_of_existing_folders(memcomp_train: Run, capfd: pytest.CaptureFixture[str]) -> None:
     small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"]
     assert memcomp_train(*small).status == 0

@@ -1,0 +1,117 @@
+"""``experiment=sampler_worth`` in small: courses, resume, report, TensorBoard."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from running import Outcome
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from memcomp_lightning.data import ShiftingBars
+from memcomp_lightning.likelihood import kl_divergence
+from memcomp_lightning.models import DBN
+from memcomp_lightning.report.worth import Courses, read_worth
+
+Run = Callable[..., Outcome]
+KEPT = ("cd1", "cd1_long", "exact", "mode_cd_exact")
+ALL = ("cd10", "pcd", "pcd_long", "pt", "mode_cd_dmm", "mode_cd_sa", "mode_pcd_exact", "mode_pcd_dmm")
+SMALL = [
+    "experiment=sampler_worth",
+    *[f"~worth.methods.{name}" for name in (*ALL, "ground_state", "time_average")],
+    "~worth.data_sets.inverted_bars",
+    "~worth.data_sets.bars_and_stripes",
+    "worth.data_sets.shifting_bars.passes=40",
+    "worth.claimed=[mode_cd_exact]",
+    "worth.baselines=[cd1,cd1_long]",
+    "worth.rates=[0.1,0.5]",
+    "worth.replicas=3",
+    "worth.choosing=2",
+    "worth.points=4",
+    "worth.workers=1",
+    "hydra.run.dir=run",
+]
+
+
+def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -> None:
+    outcome = memcomp_train(*SMALL)
+    assert outcome.status == 0, outcome.err
+    assert "mode-assisted CD-1, exact mode beats" in outcome.out
+    courses = Courses(Path("run")).all
+    assert {course.key for course in courses} == {("shifting_bars", m, r) for m in KEPT for r in (0.1, 0.5)}
+    for course in courses:
+        n_passes = 120 if course.method == "cd1_long" else 40
+        assert (course.updates[0], course.updates[-1], len(course.updates)) == (1, n_passes, 4)
+        assert all(len(scores) == 5 for scores in course.scores)
+        assert course.seconds == sorted(course.seconds)
+        exact = course.method == "exact"
+        assert all((error < 1e-6) == exact for error in course.errors[0])
+
+    path = Path("run/courses.jsonl")
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    assert memcomp_train("resume=run").status == 0
+    again = Courses(Path("run")).all
+    assert again[-1].key == courses[-1].key
+    assert again[-1].scores == courses[-1].scores
+
+    for name in ("shifting_bars.png", "shifting_bars.svg", "sampler_worth.csv", "verdicts.md", "report.html"):
+        assert Path("run", name).stat().st_size > 0
+    events = EventAccumulator("run/tensorboard/CD-1/shifting_bars").Reload()
+    median = events.Scalars("shifting_bars/kl/median")
+    best = read_worth(Path("run")).best("shifting_bars", "cd1")
+    assert [event.step for event in median] == best.updates
+    assert median[-1].value == pytest.approx(sorted(best.scores[-1][:3])[1], rel=1e-6)
+    assert any(b"method" in file.read_bytes() for file in Path("run/tensorboard/CD-1").rglob("events*"))
+    layout = EventAccumulator("run/tensorboard").Reload()
+    assert "custom_scalars__config__" in layout.Tags()["tensors"]
+
+
+def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
+    """Of the exact gradient, which draws nothing: the fourth replica is the run with seed 3."""
+    assert memcomp_train(*SMALL, "worth.rates=[0.5]").status == 0
+    decay = "{_target_:memcomp_lightning.callbacks.LearningRateDecay,n_passes:40}"
+    single = memcomp_train(
+        "data=shifting_bars",
+        "model.hidden_sizes=[18]",
+        "sampler=exact",
+        "pretrain.iterations=40",
+        "pretrain.optimizer.lr=0.5",
+        "finetune.iterations=0",
+        "callbacks.pretrain.momentum_schedule=null",
+        f"+callbacks.pretrain.learning_rate_decay={decay}",
+        "seed=3",
+        "hydra.run.dir=single",
+    )
+    assert single.status == 0, single.err
+    dbn = DBN(9, [18])
+    dbn.load_state_dict(torch.load("single/weights/pretrain.pt", weights_only=True))
+    (course,) = [c for c in Courses(Path("run")).all if c.method == "exact"]
+    found = kl_divergence(dbn[0], ShiftingBars().load().train_v)
+    assert course.scores[-1][3] == pytest.approx(float(found), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("worth.data_sets.shifting_bars.measure=accuracy", "measure = 'accuracy'"),
+        ("worth.claimed=[cd2]", "'cd2'"),
+        ("worth.rates=[]", "worth.rates = []"),
+        ("worth.replicas=0", "worth.replicas = 0"),
+        ("+worth.methods.cd1.faster=2", "setting of worth.methods.cd1 = 'faster'"),
+        ("worth.methods.cd1.overrides=['sampler=cdd']", "cdd"),
+    ],
+)
+def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override: str, message: str) -> None:
+    outcome = memcomp_train(*SMALL, override)
+    assert outcome.status != 0
+    assert message in outcome.err
+    assert not Path("run").exists()
+
+
+def test_divergence_is_a_result(memcomp_train: Run) -> None:
+    outcome = memcomp_train(*SMALL, "worth.rates=[1e30]")
+    assert outcome.status == 0, outcome.err
+    (course,) = [c for c in Courses(Path("run")).all if c.method == "cd1"]
+    assert course.scores[-1] == [float("inf")] * 5
+    assert json.loads(Path("run/worth.json").read_text())["rates"] == [1e30]
