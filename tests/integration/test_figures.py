@@ -184,7 +184,7 @@ def test_a_figure_is_trained_reported_and_resumed(memcomp_train: Run) -> None:
 
 
 def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> None:
-    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"]
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1,2]", "hydra.run.dir=run"]
     assert memcomp_train(*small).status == 0
     other = memcomp_train(*small, "pretrain.optimizer.lr=0.3")
     assert other.status != 0
@@ -254,7 +254,7 @@ def test_other_readings_of_the_paper_in_one_table(memcomp_train: Run) -> None:
 
 
 def test_report_of_existing_folders(memcomp_train: Run, capfd: pytest.CaptureFixture[str]) -> None:
-    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"]
+    small = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1,2]", "hydra.run.dir=run"]
     assert memcomp_train(*small).status == 0
     Path("run/figure4.png").unlink()
     report.main(["run", "--output", "page.html"])

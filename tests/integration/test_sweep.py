@@ -38,11 +38,13 @@ def test_failing_job_leaves_the_others_and_is_repeated_alone(
     trained: list[str] = []
     original = pipeline.run
 
-    def sometimes(plan: object, config: object, folder: object, overrides: dict[str, str]) -> dict[str, object]:
+    def sometimes(
+        plan: object, config: object, folder: object, overrides: dict[str, str], choice: object
+    ) -> dict[str, object]:
         trained.append(overrides["seed"])
         if broken and overrides["seed"] == "1" and overrides["sampler"] == "cd":
             raise RuntimeError("the disk caught fire")
-        return original(plan, config, folder, overrides)
+        return original(plan, config, folder, overrides, choice)
 
     monkeypatch.setattr(pipeline, "run", sometimes)
     broken = True
