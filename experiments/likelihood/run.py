@@ -1,0 +1,118 @@
+"""Log-likelihoods of RBMs on binarised MNIST beside published ones: exact, by AIS, and by reverse AIS.
+
+python experiments/likelihood/run.py                      # 784 x 16, 50 passes, centred and plain
+python experiments/likelihood/run.py --hidden 500 --passes 200 --only centred --fantasy-sweeps 1000
+"""
+
+import argparse
+import json
+import time
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch.optim import SGD
+
+from memcomp_lightning import rng
+from memcomp_lightning.data import ImageDataModule, Mnist
+from memcomp_lightning.likelihood import (
+    Ais,
+    ReverseAis,
+    base_of,
+    exact_samples,
+    log_likelihood,
+    log_partition_function,
+)
+from memcomp_lightning.models import DBN, RBM, Xavier
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.replicas import Rates, pretrain_layer
+from memcomp_lightning.samplers import PCD
+from memcomp_lightning.samplers.gibbs import sweep
+
+CASES = {"centred": Centring(rate=0.01), "plain": None}
+
+
+def trained(data: ImageDataModule, given: argparse.Namespace, centring: Centring | None) -> tuple[RBM, float]:
+    """An RBM after all passes of PCD-1, and the seconds; visible biases begin at the log odds of the data."""
+    dbn = DBN(784, [given.hidden], weight_init=Xavier(gain=1.0), generator=rng.stream(given.seed, "weights"))
+    with torch.no_grad():
+        dbn[0].b.copy_(base_of(data.images.train_v))
+    batches = data.train_batches(0, 1)
+    passes = pretrain_layer(
+        dbn,
+        0,
+        batches,
+        PCD(k=1, n_chains=100),
+        iterations=given.passes,
+        rates=Rates(partial(SGD, lr=given.rate)),
+        centring=centring,
+        generator=rng.stream(given.seed, "negative_phase"),
+    )
+    begin = time.perf_counter()
+    for done in passes:
+        print(f"pass {done.number} of {given.passes}, {time.perf_counter() - begin:.0f} s", end="\r", flush=True)
+    return dbn[0], time.perf_counter() - begin
+
+
+def model_samples(rbm: RBM, n: int, n_sweeps: int, start: torch.Tensor) -> torch.Tensor:
+    """Exact samples where the hidden layer can be enumerated, otherwise chains that start at images."""
+    generator = rng.stream(0, "model samples")
+    if rbm.n_hidden <= 25:
+        return exact_samples(rbm, n, generator=generator)
+    v = start[:n]
+    for _ in range(n_sweeps):
+        v = sweep(rbm, v, generator=generator)
+    return v
+
+
+def measured(rbm: RBM, data: ImageDataModule, given: argparse.Namespace) -> dict[str, float]:
+    """Nats an image, and log Z three ways."""
+    train, test = data.images.train_v, data.images.test_v
+    base = base_of(train)
+    ais = Ais(n_chains=given.chains, n_betas=given.betas)
+    up = ais.estimate(rbm, generator=rng.stream(0, "ais"), base=base)
+    samples = model_samples(rbm, given.chains, given.fantasy_sweeps, train)
+    down = ReverseAis(n_betas=given.betas).estimate(
+        rbm, samples, generator=rng.stream(0, "reverse ais"), base=base
+    )
+    estimates = {"ais": up.log_z, "reverse_ais": down.log_z}
+    if given.hidden <= 25:
+        estimates = {"exact": log_partition_function(rbm), **estimates}
+    found = {f"log_z_{name}": float(log_z) for name, log_z in estimates.items()}
+    for name, log_z in estimates.items():
+        found[f"test_{name}"] = float(log_likelihood(rbm, test, log_z).mean())
+    for name, estimate in (("ais", up), ("reverse_ais", down)):
+        found[f"{name}_standard_error"] = float(estimate.standard_error)
+        found[f"{name}_effective_sample_size"] = float(estimate.effective_sample_size)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--hidden", type=int, default=16)
+    parser.add_argument("--passes", type=int, default=50)
+    parser.add_argument("--rate", type=float, default=0.01)
+    parser.add_argument("--only", choices=tuple(CASES))
+    parser.add_argument("--chains", type=int, default=100, help="of AIS")
+    parser.add_argument("--betas", type=int, default=10_000, help="of AIS")
+    parser.add_argument(
+        "--fantasy-sweeps", type=int, default=1000, help="Gibbs sweeps before reverse AIS, above 25 units"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, help="JSON lines")
+    given = parser.parse_args()
+    images = Mnist(pixels="threshold").load()
+    data = ImageDataModule(images, batch_size=100, seed=given.seed)
+    for name, centring in CASES.items():
+        if given.only in (None, name):
+            rbm, seconds = trained(data, given, centring)
+            found = {"case": name, "hidden": given.hidden, "passes": given.passes, "seconds": round(seconds, 1)}
+            line = json.dumps({**found, **measured(rbm, data, given)})
+            print(line.ljust(60))
+            if given.output:
+                with given.output.open("a") as file:
+                    file.write(line + "\n")
+
+
+if __name__ == "__main__":
+    main()
