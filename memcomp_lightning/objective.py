@@ -22,7 +22,8 @@ class Offsets(NamedTuple):
 class Centring:
     """Settings of the centred gradient: the means of the positive phase, followed update by update.
 
-    Montavon & Mueller 2012; Melchior, Fischer & Wiskott 2016 ("dd", with the sliding average that they recommend).
+    Of an update in chunks the first chunk counts. Montavon & Mueller 2012; Melchior, Fischer & Wiskott 2016 ("dd",
+    with the sliding average that they recommend).
 
     Attributes:
         rate: Weight of the newest update in the offsets, in (0, 1].

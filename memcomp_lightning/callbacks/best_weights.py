@@ -65,6 +65,10 @@ class BestWeights(pl.Callback):
         if self._weights:
             pl_module.load_state_dict(self._weights)
 
+    def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """The same where nothing was left to train, after an interruption at the very end."""
+        self.on_train_end(trainer, pl_module)
+
     def state_dict(self) -> dict[str, Any]:
         """Accuracies and weights."""
         return {"accuracy": self.accuracy, "weights": self._weights}

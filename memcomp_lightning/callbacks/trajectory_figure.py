@@ -9,7 +9,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, rbm_of, tensorboards, write_figure
 from memcomp_lightning.dmm import DmmSolver, Recording
-from memcomp_lightning.errors import require
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 from memcomp_lightning.qubo import Qubo, QuboSolver, from_model
 
@@ -41,6 +41,7 @@ class TrajectoryFigure(EveryIterations):
             "a solver that records its trajectory, for TrajectoryFigure",
             "Use DmmSolver(record=Recording(every=1)).",
         )
+        require_count("last", last)
         self.last = last
         self.seed = seed
 

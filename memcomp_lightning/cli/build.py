@@ -1,5 +1,7 @@
 """From a configuration to the objects of a run; everything that can be refused is refused here."""
 
+import copy
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +22,8 @@ from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import Classifier, DBNClassifier, DBNPretraining, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import load_weights
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.samplers import ModeAssisted
 
 
 @dataclass(frozen=True)
@@ -84,17 +88,20 @@ def build(config: DictConfig) -> Plan:
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = None
     if isinstance(network, DBN) and config.pretrain.iterations > 0:
-        callbacks = _callbacks(config, "pretrain")
+        callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
+        centring = instantiate(config.pretrain.centring)
+        allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
+        require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         pretraining = Stage(
             DBNPretraining(
                 network,
-                instantiate(config.sampler),
+                _sampler(config, data),
                 iterations=config.pretrain.iterations,
                 optimizer=_optimizer(config, "pretrain", callbacks),
-                centring=instantiate(config.pretrain.centring),
+                centring=centring,
                 seed=seed,
             ),
-            _data(config, "pretrain", images),
+            data,
             callbacks,
         )
     if config.finetune.iterations > 0:
@@ -162,6 +169,21 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
         load_weights(network, Path(weights))
     network.to(_PRECISIONS.get(str(config.trainer.precision), torch.float32))
     return network
+
+
+def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
+    """The sampler; the schedule of mode assistance spans all updates of a layer unless it says otherwise."""
+    settings = copy.deepcopy(config.sampler)
+    schedule = settings.get("schedule")
+    if schedule is not None and schedule.get("n_updates") is None:
+        size = config.pretrain.batch_size or data.n_train
+        schedule.n_updates = config.pretrain.iterations * math.ceil(data.n_train / size)
+    sampler = instantiate(settings)
+    if isinstance(sampler, ModeAssisted):
+        chunk, size = config.data.chunk_size, config.pretrain.batch_size or data.n_train
+        remedy = "Each chunk would toss the coin for itself: raise data.chunk_size or lower pretrain.batch_size."
+        require(chunk >= size, "data.chunk_size", chunk, f"at least the {size} images of an update", remedy)
+    return sampler
 
 
 def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:

@@ -5,7 +5,7 @@ import json
 import logging
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.cli.errors import UserError
@@ -28,12 +28,15 @@ def tried_values(config: DictConfig) -> list[float]:
     """
     if config.choose is None:
         return []
+    allowed = "{setting: NAME, values: [...]}, or null"
+    require(isinstance(config.choose, DictConfig), "choose", config.choose, allowed)
     for key in config.choose:
         require_choice("setting of choose", str(key), ("setting", "values"))
-    values = list(config.choose.get("values") or [])
-    require(len(values) > 0, "choose.values", values, "at least one value")
+    values = config.choose.get("values")
+    numbers = isinstance(values, ListConfig) and all(type(value) in (int, float) for value in values)
+    require(numbers and len(values) > 0, "choose.values", values, "a list of at least one number")
     with_choice(config, values[0])
-    return values
+    return list(values)
 
 
 def with_choice(config: DictConfig, value: float) -> DictConfig:
@@ -72,9 +75,10 @@ def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str,
         return with_choice(config, found["value"]), found
     accuracies = []
     for number, value in enumerate(values, start=1):
-        plain: Any = OmegaConf.to_container(for_trial(config, value), resolve=False)
-        member = Member("choose", plain, config.pretrain.iterations, config.seed, value, choosing=True)
-        (record,) = run_unit(Unit((member,), (config.finetune.iterations,), 0), lambda what, n_updates: None)
+        trial = for_trial(config, value)
+        plain: Any = OmegaConf.to_container(trial, resolve=False)
+        member = Member("choose", plain, trial.pretrain.iterations, trial.seed, value, choosing=True)
+        (record,) = run_unit(Unit((member,), (trial.finetune.iterations,), 0), lambda what, n_updates: None)
         accuracies.append(float(record.score("validation_accuracy").mean()))
         log.info(
             "Trial %d of %d: %s = %s, accuracy %.4f on held-out training images",

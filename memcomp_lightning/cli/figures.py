@@ -16,10 +16,11 @@ from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
 from memcomp_lightning.cli.workers import runner
-from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.report import Plan, Records
 
+_SET_BY_FIGURE = ("pretrain.iterations", "finetune.iterations", "seed")
 CURVE_SETTINGS = ("label", "overrides", "iterations")
 
 
@@ -46,7 +47,8 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
 
 def _curves(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfig]:
     """Settings of each curve, composed before anything trains: a file edited meanwhile changes nothing."""
-    return {str(n): composed_for((*overrides, *curve.overrides)) for n, curve in config.figure.curves.items()}
+    curves = config.figure.curves.items()
+    return {str(name): composed_for(tuple(overrides), tuple(curve.overrides)) for name, curve in curves}
 
 
 def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictConfig, list[str]]]:
@@ -78,9 +80,14 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
         "claims": figure["claims"],
         "labels": {name: curves[name]["label"] for name in dict.fromkeys((*claimed, *curves))},
         "chosen": {name: own.choose.setting for name, own in composed.items() if tried_values(own)},
-        "stop_early": [name for name, own in composed.items() if own.callbacks.finetune.get("best_weights")],
+        "stop_early": [name for name, own in composed.items() if _stops_early(own)],
         "scale": ", ".join(part for part in (whole, parts, seeds) if part),
     }
+
+
+def _stops_early(config: DictConfig) -> bool:
+    callbacks = [callback for callback in config.callbacks.finetune.values() if callback is not None]
+    return any(callback["_target_"].endswith(".BestWeights") for callback in callbacks)
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -93,9 +100,14 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for name, curve in config.figure.curves.items():
         for key in curve:
             require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)
-    for settings in _curves(config, overrides).values():
+    for name, settings in _curves(config, overrides).items():
         values = tried_values(settings)
-        build(for_trial(settings, values[0]) if values else settings)
+        if values:
+            allowed = "a setting that the figure does not set itself, for each network of a curve"
+            chosen = settings.choose.setting
+            require(chosen not in _SET_BY_FIGURE, f"choose.setting of figure.curves.{name}", chosen, allowed)
+        for own in [for_trial(settings, value) for value in values] or [settings]:
+            build(own)
 
 
 def plan_units(
@@ -142,17 +154,20 @@ def _members(
 
 
 @functools.cache
-def composed_for(overrides: tuple[str, ...]) -> DictConfig:
+def composed_for(common: tuple[str, ...], own: tuple[str, ...] = ()) -> DictConfig:
     """The configuration of one curve, without the figure; not to be changed.
 
-    Settings that the curve does not have are left out: ``solver.max_steps`` where its solver is descent.
+    Args:
+        common: Overrides of all curves. Those that a curve has no setting for are left out: ``solver.max_steps``
+            where its solver is descent.
+        own: The curve's overrides, which must apply.
     """
-    own = [o for o in overrides if not o.lstrip("+~").startswith(_OF_MANY_RUNS)]
+    common = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
     try:
-        composed = compose("config", own)
+        composed = compose("config", [*common, *own])
     except ConfigCompositionException:
-        bare = compose("config", [o for o in own if "." not in o.partition("=")[0]])
-        composed = compose("config", [o for o in own if _applies(o.partition("=")[0], bare)])
+        bare = compose("config", [o for o in (*common, *own) if "." not in o.partition("=")[0]])
+        composed = compose("config", [*(o for o in common if _applies(o.partition("=")[0], bare)), *own])
     composed.figure = composed.worth = None
     return composed
 

@@ -17,7 +17,7 @@ from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import write_text, written_whole
 from memcomp_lightning.plotting import plot_against_iterations, plot_against_passes, plot_controls
 from memcomp_lightning.report import Section, Verdict, markdown, page, read_results, verdicts
-from memcomp_lightning.report.worth import read_worth
+from memcomp_lightning.report.worth import WORTH_RULE, read_worth
 
 COMMAND = "memcomp-report"
 
@@ -62,7 +62,7 @@ def _report_worth(folder: Path) -> Section:
         raise UserError(f"{folder} has no courses yet: go on with memcomp-train resume={folder}")
     figures, judged, notes = write_worth(worth, folder)
     pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
-    return Section(worth.plan["title"], pictures, judged, [*_origin(folder), *notes])
+    return Section(worth.plan["title"], pictures, judged, [*_origin(folder), *notes], WORTH_RULE)
 
 
 def save(folder: Path, name: str, figure: Figure) -> bytes:

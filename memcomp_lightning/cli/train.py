@@ -50,23 +50,23 @@ def train(config: DictConfig) -> None:
 
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
+    if config.worth is not None:
+        worth.check(config, overrides)
+        return
     if config.figure is not None:
         for part, own in figures.parts(config, overrides).values():
             check = trajectory.prepare if "curves" not in part.figure else figures.check
             check(part, own)
         return
-    if config.worth is not None:
-        worth.check(config, overrides)
-        return
     values = tried_values(config)
     n_passes = config.finetune.iterations
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
-    plan = build(for_trial(config, values[0]) if values else config)
+    plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
     try:
         trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
     except MisconfigurationException as error:
         raise UserError(explain(error)) from error
-    for stage in plan.stages:
+    for stage in plans[0].stages:
         stage.data.train_batches(0, trainer.world_size)
 
 

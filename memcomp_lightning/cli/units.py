@@ -49,8 +49,9 @@ class Member:
         """What networks must share to be fine-tuned as one program."""
         config = self.config
         shared = {name: config[name] for name in ("data", "finetune", "trainer")}
+        callbacks = [callback for callback in config["callbacks"]["finetune"].values() if callback is not None]
         shared["schedules"] = [
-            config["callbacks"]["finetune"].get(name) for name in ("momentum_schedule", "learning_rate_decay")
+            c for c in callbacks if c["_target_"].endswith((".MomentumSchedule", ".LearningRateDecay"))
         ]
         shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)

@@ -15,20 +15,21 @@ from torch import Tensor
 from tqdm import tqdm
 
 from memcomp_lightning import rng
+from memcomp_lightning.callbacks.gradient_bias import gradient
 from memcomp_lightning.cli.build import Stage, build
+from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.units import Progress, rates_of
 from memcomp_lightning.cli.workers import runner
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import SettingError, require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules import DBNPretraining, DivergedError
 from memcomp_lightning.modules.stage import LARGEST_WEIGHT
-from memcomp_lightning.objective import contrast
 from memcomp_lightning.replicas import Pass, pretrain_layer, stacked
 from memcomp_lightning.report.worth import Course, Courses
-from memcomp_lightning.samplers import Exact
+from memcomp_lightning.samplers import Exact, positive_phase
 
 DATA_SETTINGS = ("label", "overrides", "passes", "measure")
 METHOD_SETTINGS = ("label", "overrides", "longer")
@@ -76,6 +77,11 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         UserError, SettingError, InstantiationException: As ``build``.
     """
     worth = config.worth
+    if config.figure is not None:
+        raise UserError(
+            "preset=quick is one of figures: make the comparison smaller with worth.rates=[...], worth.replicas=N "
+            "or ~worth.data_sets.NAME."
+        )
     for key in ("replicas", "choosing", "points", "gradient_draws"):
         require_count(f"worth.{key}", worth[key])
     require(len(worth.rates) > 0, "worth.rates", list(worth.rates), "at least one learning rate")
@@ -87,9 +93,17 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         require_choice(f"worth.data_sets.{name}.measure", data_set.measure, tuple(_MEASURES))
     for name in (*worth.claimed, *worth.baselines):
         require_choice("worth.claimed and worth.baselines", name, tuple(worth.methods))
+    if worth.workers is not None:
+        require_count("worth.workers", worth.workers)
+    require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
     for job in _jobs(config, overrides, done=set()):
+        plan = build(OmegaConf.create(job.config))
+        stage, rbm = plan.pretraining, _dbn(plan.network)[0]
+        assert stage is not None
+        partitions = stage.data.replicas
+        require(partitions == (), "data.partitions", partitions, "1: replicas are seeds here")
         if job.rate == worth.rates[0]:
-            build(OmegaConf.create(job.config))
+            _MEASURES[job.measure](stage)(rbm)
 
 
 def train_worth(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
@@ -100,7 +114,7 @@ def train_worth(config: DictConfig, overrides: Sequence[str], folder: Path) -> N
     )
     jobs = list(_jobs(config, overrides, done={course.key for course in courses.all}))
     with (
-        runner(config.worth.workers, config.trainer.accelerator, run_job) as run,
+        runner(config.worth.workers, "cpu", run_job) as run,
         tqdm(total=sum(job.n_updates for job in jobs), unit="update", unit_scale=True) as bar,
     ):
 
@@ -116,8 +130,10 @@ def _jobs(config: DictConfig, overrides: Sequence[str], done: set[Any]) -> Itera
     worth = config.worth
     for data_name, data_set in worth.data_sets.items():
         for method_name, method in worth.methods.items():
-            passes = int(data_set.passes * method.get("longer", 1))
-            composed = composed_for((*overrides, *data_set.overrides, *method.overrides, *_run_settings(passes)))
+            passes = max(1, round(data_set.passes * method.get("longer", 1)))
+            composed = composed_for(
+                tuple(overrides), (*data_set.overrides, *method.overrides, *_run_settings(passes))
+            )
             for rate in worth.rates:
                 if (data_name, method_name, rate) in done:
                     continue
@@ -189,8 +205,8 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
             seconds += time.perf_counter() - begin
             progress(f"{job.title}, update {done.number} of {job.points[-1]}", done.number - reported)
             reported = done.number
-            cosine, error = gradient_bias(dbn[0], module, done, job.gradient_draws)
             rbm, diverged = without_diverged(dbn[0])
+            cosine, error = gradient_bias(rbm, module.sampler, done, job.gradient_draws)
             score = measure(rbm).double().masked_fill(diverged, math.inf)
             course.updates.append(done.number * updates_a_pass)
             course.seconds.append(seconds)
@@ -198,8 +214,13 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
             course.cosines.append(cosine.tolist())
             course.errors.append(error.tolist())
             begin = time.perf_counter()
-    except DivergedError:
-        pass  # Found after the last measurement, which says it.
+    except (DivergedError, SettingError):  # the second is a solver's that is given NaN
+        for updates in job.points[len(course.updates) :]:
+            course.updates.append(updates * updates_a_pass)
+            course.seconds.append(seconds)
+            course.scores.append([math.inf] * job.n_replicas)
+            course.cosines.append([math.nan] * job.n_replicas)
+            course.errors.append([math.nan] * job.n_replicas)
     return [course]
 
 
@@ -216,27 +237,25 @@ def without_diverged(rbm: RBM) -> tuple[RBM, Tensor]:
 
 
 @torch.no_grad()
-def gradient_bias(rbm: RBM, module: DBNPretraining, done: Pass, n_draws: int) -> tuple[Tensor, Tensor]:
+def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Tensor, Tensor]:
     """Cosine and relative error of a sampler's mean gradient against the exact one, ``(*replicas,)`` each.
 
-    Of the mean over some draws, so that what is left is mostly bias. NaN where the smaller layer is too large.
+    Of the mean over some draws from the sampler's present state: noise of the draws is small in it, that of where
+    persistent chains are is not, and a coin of small probability comes up in few of them. NaN where the smaller
+    layer is too large.
     """
     exact, generator = Exact(max_units=16), rng.stream(done.number, "gradient bias")
     if min(rbm.n_visible, rbm.n_hidden) > exact.max_units:
         nothing = torch.full(rbm.replicas, math.nan)
         return nothing, nothing
-    draws = 1 if module.sampler.shared else n_draws
+    positive = positive_phase(rbm, done.positive.v)
 
-    def gradient(sampler: Any, state: Any) -> Tensor:
-        negative = sampler.sample(rbm, state, done.positive, generator=generator).configurations
-        with torch.enable_grad():
-            total = contrast(rbm, done.positive, negative).sum()
-            parts = torch.autograd.grad(total, list(rbm.parameters()))
-        n = len(rbm.replicas)
-        return torch.cat([part.flatten(n) for part in parts], dim=-1).double()
+    def of(sampler: Any, state: Any) -> Tensor:
+        negative = sampler.sample(rbm, state, positive, generator=generator).configurations
+        return gradient(rbm, positive, negative).double()
 
-    true = gradient(exact, exact.init(rbm, 1, generator=generator))
-    mean = torch.stack([gradient(module.sampler, done.state) for _ in range(draws)]).mean(0)
+    true = of(exact, exact.init(rbm, 1, generator=generator))
+    mean = torch.stack([of(sampler, done.state) for _ in range(1 if sampler.shared else n_draws)]).mean(0)
     cosine = torch.cosine_similarity(mean, true, dim=-1)
     return cosine, (mean - true).norm(dim=-1) / true.norm(dim=-1)
 

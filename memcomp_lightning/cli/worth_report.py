@@ -13,7 +13,7 @@ from torch.utils.tensorboard.summary import hparams
 from memcomp_lightning.files import write_text
 from memcomp_lightning.plotting import plot_worth
 from memcomp_lightning.report import Verdict, markdown
-from memcomp_lightning.report.worth import WORTH_RULE, Course, Worth, worth_table, worth_verdicts
+from memcomp_lightning.report.worth import Course, Worth, worth_table, worth_verdicts
 
 NUMBERS = "sampler_worth.csv"
 
@@ -27,7 +27,7 @@ def write_worth(worth: Worth, folder: Path) -> tuple[dict[str, Figure], list[Ver
     write_text(folder / "verdicts.md", markdown(judged))
     _write_events(worth, folder / "tensorboard")
     figures = {name: plot_worth(worth, name) for name in worth.data_sets}
-    return figures, judged, [WORTH_RULE, f"Numbers: {NUMBERS}"]
+    return figures, judged, [f"Numbers: {NUMBERS}"]
 
 
 def _write_events(worth: Worth, folder: Path) -> None:

@@ -188,7 +188,7 @@ class DBNPretraining(StageModule):
     def take_extra_state(self, state: dict[str, Any]) -> None:
         """Take back the sampler's chains, the offsets and the energy gaps."""
         self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
-        if state["offsets"] is not None:
+        if state.get("offsets") is not None:
             self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
         if state["sampler"] is not None:
             template = self.sampler.init(self.rbm, 1, generator=rng.stream(self.seed, "check"))

@@ -27,7 +27,8 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
     for number, method in enumerate(worth.methods(data_set)):
         course, scores = worth.best(data_set, method), worth.values(worth.best(data_set, method))
         claimed = method in worth.plan["claimed"]
-        style = {"color": f"C{number % 10}", "ls": "-" if claimed else "--", "lw": 1.6 if claimed else 1.0}
+        line = "-" if claimed else ("--", "-.")[number // 10 % 2]
+        style = {"color": f"C{number % 10}", "ls": line, "lw": 1.6 if claimed else 1.0}
         label = f"{worth.plan['methods'][method]['label']} (lr = {course.rate:g})"
         median, worst = np.median(scores, axis=1), scores.max(axis=1)
         for axes, x in ((by_update, course.updates), (by_time, course.seconds)):

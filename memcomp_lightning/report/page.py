@@ -18,7 +18,7 @@ pre, small { color: #555 }
 """
 
 
-_HEADER = ("claim of the paper", "measured", "paired difference", "verdict", "controls that explain it")
+_HEADER = ("claim of the paper", "measured", "difference", "verdict", "controls that explain it")
 
 
 class Section(NamedTuple):
@@ -29,22 +29,25 @@ class Section(NamedTuple):
         pictures: Caption and PNG of each.
         verdicts: Rows of the table.
         notes: Lines below: settings, time, where the numbers are.
+        rule: How verdicts are made.
     """
 
     title: str
     pictures: Sequence[tuple[str, bytes]]
     verdicts: Sequence[Verdict]
     notes: Sequence[str]
+    rule: str = RULE
 
 
 def page(sections: Sequence[Section]) -> str:
     """Return the page."""
     body = "\n".join(_section(section) for section in sections)
+    rules = "".join(f"<p>{escape(rule)}</p>" for rule in dict.fromkeys(section.rule for section in sections))
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>memcomp_lightning: report</title><style>{_STYLE}</style></head>\n"
-        f"<body><h1>memcomp_lightning: report</h1>\n{body}\n<h2>How verdicts are made</h2><p>{escape(RULE)}</p>"
+        f"<body><h1>memcomp_lightning: report</h1>\n{body}\n<h2>How verdicts are made</h2>{rules}"
         "</body></html>\n"
     )
 

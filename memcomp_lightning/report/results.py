@@ -81,6 +81,9 @@ class Plan:
         require_choice("figure.against", self.against, ("iterations", "passes"))
         for curve in self.claimed:
             require_choice("figure.claims", curve, tuple(self.labels))
+        for claim in self.claims:
+            for curve in claim.controls or ():
+                require_choice("controls of figure.claims", curve, tuple(self.labels))
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> "Plan":
@@ -110,14 +113,17 @@ class Results:
         self.seconds = sum(record.pretrain_s + record.finetune_s for record in records.all)
         for curve in plan.labels:
             by_length: dict[int, list[NDArray[np.float64]]] = {}
+            seeds = {record.seed for record in records.all if not record.choosing}
             for record in records.of(curve):
                 early = curve in plan.stop_early
                 accuracy = record.at_best_validation() if early else record.score("test_accuracy")
                 by_length.setdefault(record.iterations, []).append(accuracy)
-            if by_length:
+            # A point counts once all seeds have trained: differences are between pairs.
+            whole = {n: parts for n, parts in by_length.items() if len(parts) == len(seeds)}
+            if whole:
                 self._values[curve] = {
                     n: dict(zip(plan.passes, np.concatenate(parts, axis=1), strict=True))
-                    for n, parts in by_length.items()
+                    for n, parts in whole.items()
                 }
 
     @cached_property

@@ -76,7 +76,7 @@ class ModeAssisted:
     with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state in units
     of the largest that couplings of one can give. The scaled update is written as a negative phase: x* has the
     weight g, the positive phase keeps 1 - g. One coin serves all replicas, so that a ground state is computed only
-    when it is used; an update in chunks tosses it for each chunk.
+    when it is used. The coin is tossed and counted once a call: give all images of an update at once.
 
     Attributes:
         inner: Sampler of the other updates.

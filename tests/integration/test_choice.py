@@ -28,6 +28,14 @@ def test_the_run_is_the_one_with_the_chosen_value(memcomp_train: Run) -> None:
     assert chosen["choice"]["accuracies"][1] > chosen["choice"]["accuracies"][0]
 
 
+def test_lengths_of_training_can_be_chosen(memcomp_train: Run) -> None:
+    choose = "choose={setting:finetune.iterations,values:[1,30]}"
+    outcome = memcomp_train(*FAST, "sampler=cd", "control=xavier_4", choose, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert found("run")["choice"]["value"] == 30
+    assert found("run")["stages"]["finetune"]["iterations"] == 30
+
+
 def test_the_choice_of_an_interrupted_run_stands(memcomp_train: Run) -> None:
     small = [*FAST, "sampler=cd", RATES, "hydra.run.dir=run"]
     assert memcomp_train(*small).status == 0
@@ -53,6 +61,9 @@ def test_every_job_of_a_sweep_chooses_for_itself(memcomp_train: Run) -> None:
         ("choose={setting:sampler.k,values:[]}", "choose.values = []"),
         ("choose={setting:sampler.k,value:[1]}", "setting of choose = 'value'"),
         ("choose={setting:sampler.k,values:[0]}", "k = 0"),
+        ("choose={setting:sampler.k,values:[1,0]}", "k = 0"),
+        ("choose={setting:sampler.hidden,values:[mean]}", "choose.values = ['mean']"),
+        ("choose=rate", "choose"),
     ],
 )
 def test_what_cannot_be_chosen_is_refused(memcomp_train: Run, override: str, message: str) -> None:

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 from running import FAST, Outcome
 
 import memcomp_lightning
+from memcomp_lightning.cli.build import build
 
 Run = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"
@@ -34,6 +36,19 @@ def test_exact_sampler_trains_a_small_model(memcomp_train: Run) -> None:
         "sampler=exact", "data=shifting_bars", "model.hidden_sizes=[7]", "finetune.batch_size=9", *FAST
     )
     assert outcome.status == 0, outcome.err
+
+
+def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_train: Run) -> None:
+    small = [*FAST, "sampler=mode_assisted_cd", "pretrain.iterations=3"]
+    for batch_size, n_updates in (("null", 3), ("500", 9)):
+        overrides = [*small, f"pretrain.batch_size={batch_size}"]
+        with initialize_config_module("memcomp_lightning.conf", version_base="1.3"):
+            plan = build(compose("config", overrides))
+        assert plan.pretraining is not None
+        assert plan.pretraining.module.sampler.schedule.n_updates == n_updates  # type: ignore[attr-defined]
+    outcome = memcomp_train(*small, "data.chunk_size=1000")
+    assert outcome.status != 0
+    assert "data.chunk_size = 1000 is not allowed: expected at least the 1437 images of an update" in outcome.err
 
 
 MANY_RUNS = ("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "sampler_worth")

@@ -203,6 +203,12 @@ def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> 
         ("figure.claims=[{better:memqubo,than:cd1}]", "figure.claims = 'memqubo'"),
         ("figure.against=epochs", "figure.against = 'epochs'"),
         ("+figure.curves.x={label: x, overrides: ['sampler=cdd']}", "cdd"),
+        ("+figure.curves.x={label: x, overrides: ['sampler=cd', 'sampler.kk=2']}", "kk"),
+        ("figure.claims=[{better:mem_qubo,than:cd1,controls:[shufled]}]", "controls of figure.claims = 'shufled'"),
+        (
+            "+figure.curves.x={label: x, overrides: ['choose={setting:pretrain.iterations,values:[1]}']}",
+            "choose.setting of figure.curves.x = 'pretrain.iterations'",
+        ),
         (
             "+figure.curves.x={label: x, overrides: ['choose={setting:pretrain.optimizer.rate,values:[1]}']}",
             "choose.setting = 'pretrain.optimizer.rate' is no setting of this run",

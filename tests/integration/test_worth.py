@@ -100,6 +100,11 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         ("worth.replicas=0", "worth.replicas = 0"),
         ("+worth.methods.cd1.faster=2", "setting of worth.methods.cd1 = 'faster'"),
         ("worth.methods.cd1.overrides=['sampler=cdd']", "cdd"),
+        ("worth.methods.cd1.overrides=['sampler=cd','sampler.kk=10']", "kk"),
+        ("worth.rates=[0.1,-1]", "learning rate"),
+        ("data.partitions=3", "data.partitions = (3,)"),
+        ("trainer.accelerator=gpu", "trainer.accelerator = 'gpu'"),
+        ("preset=quick", "preset=quick is one of figures"),
     ],
 )
 def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override: str, message: str) -> None:

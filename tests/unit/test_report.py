@@ -154,7 +154,7 @@ def test_fewer_iterations_are_none_where_no_iteration_is_needed(tmp_path):
     assert free[-2:] == ("holds only without controls", ("no pretraining",))
     assert measured("d", record("free", 0.4, 0)).verdict == HOLDS
     useless = measured("e", cd_first=0.5)
-    assert useless[1:4] == ("CD-1: 0.500 at N = 5, no more than at N = 1", "", "does not hold")
+    assert useless[1:4] == ("CD-1: 0.500 at N = 5, not significantly more than at N = 1", "", "does not hold")
 
 
 def test_a_claim_has_controls_of_its_own(tmp_path):

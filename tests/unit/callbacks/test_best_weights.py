@@ -1,5 +1,6 @@
 """The weights of the best pass, a pass of its own for each replica."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,14 +40,16 @@ class Counter(pl.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def fit(module: Counter, folder: Path, n_passes: int, resume_from: Path | None = None) -> Any:
+def fit(
+    module: Counter, folder: Path, n_passes: int, resume_from: Path | None = None, also: Sequence[pl.Callback] = ()
+) -> Any:
     loader = DataLoader(TensorDataset(torch.zeros(1, 1)))
     quiet = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
     trainer = pl.Trainer(
         max_epochs=n_passes,
         accelerator="cpu",
         logger=False,
-        callbacks=[BestWeights()],
+        callbacks=[BestWeights(), *also],
         num_sanity_val_steps=1,
         default_root_dir=folder,
         **quiet,
@@ -83,6 +86,18 @@ def test_the_best_pass_before_an_interruption_counts(tmp_path: Path) -> None:
 
     with pytest.raises(StoppedError):
         fit(Fails(), tmp_path, 4)
+    module = Counter()
+    fit(module, tmp_path, 4, tmp_path / "last.ckpt")
+    assert module.weight.tolist() == [[2, 2, 2], [3, 3, 3]]
+
+
+def test_a_run_that_stopped_after_its_last_pass_ends_with_the_best_one(tmp_path: Path) -> None:
+    class KeepsLast(pl.Callback):
+        def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+            trainer.save_checkpoint(tmp_path / "last.ckpt")
+
+    last = fit(Counter(), tmp_path, 4, also=[KeepsLast()])
+    assert last.current_epoch == 4
     module = Counter()
     fit(module, tmp_path, 4, tmp_path / "last.ckpt")
     assert module.weight.tolist() == [[2, 2, 2], [3, 3, 3]]
