@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -54,3 +54,12 @@ def start_process(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
         return launch(*arguments, folder=tmp_path)
 
     return start
+
+
+@pytest.fixture
+def joblib_launcher() -> Iterator[list[str]]:
+    """Overrides that choose it; its processes, which stay in the folder of the test, end with the test."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    loky = pytest.importorskip("joblib.externals.loky")
+    yield ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    loky.get_reusable_executor().shutdown(wait=True)

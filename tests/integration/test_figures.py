@@ -76,12 +76,11 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
 
 
-def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run) -> None:
+def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run, joblib_launcher: list[str]) -> None:
     """As a user would ask Hydra for Fig. 4: samplers, pretraining lengths and seeds, by the joblib launcher."""
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     single = ["data=digits", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=3"]
     sweep = ["-m", "sampler=cd,dmm_qubo", "pretrain.iterations=range(1,3)", "seed=range(2)"]
-    quiet = ["callbacks=minimal", "logger=none", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    quiet = ["callbacks=minimal", "logger=none", *joblib_launcher]
     outcome = memcomp_train(*sweep, *single, *quiet, "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.err
     figure = [

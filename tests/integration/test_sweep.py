@@ -93,12 +93,10 @@ def test_paths_among_the_overrides_and_unfinished_jobs(memcomp_train: Run) -> No
     assert "killed job\n    did not finish" in outcome.out
 
 
-def test_joblib_launcher_gives_the_same_results(memcomp_train: Run) -> None:
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+def test_joblib_launcher_gives_the_same_results(memcomp_train: Run, joblib_launcher: list[str]) -> None:
     sweep = ["-m", "sampler=cd", "seed=0,1", *FAST]
     assert memcomp_train(*sweep, "hydra.sweep.dir=sweep").status == 0
-    parallel = ["hydra.sweep.dir=parallel", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    outcome = memcomp_train(*sweep, *parallel)
+    outcome = memcomp_train(*sweep, *joblib_launcher, "hydra.sweep.dir=parallel")
     assert outcome.status == 0, outcome.err
     for row, other in zip(rows("sweep/table.csv"), rows("parallel/table.csv"), strict=True):
         assert row["test_accuracy_mean"] == other["test_accuracy_mean"]
