@@ -33,10 +33,11 @@ CASES = {"centred": Centring(rate=0.01), "plain": None}
 
 
 def trained(data: ImageDataModule, given: argparse.Namespace, centring: Centring | None) -> tuple[RBM, float]:
-    """An RBM after all passes of PCD-1, and the seconds; visible biases begin at the log odds of the data."""
+    """An RBM after all passes of PCD-1, and the seconds."""
     dbn = DBN(784, [given.hidden], weight_init=Xavier(gain=1.0), generator=rng.stream(given.seed, "weights"))
-    with torch.no_grad():
-        dbn[0].b.copy_(base_of(data.images.train_v))
+    if given.visible_bias == "data":
+        with torch.no_grad():
+            dbn[0].b.copy_(base_of(data.images.train_v))
     batches = data.train_batches(0, 1)
     passes = pretrain_layer(
         dbn,
@@ -92,6 +93,9 @@ def main() -> None:
     parser.add_argument("--hidden", type=int, default=16)
     parser.add_argument("--passes", type=int, default=50)
     parser.add_argument("--rate", type=float, default=0.01)
+    parser.add_argument(
+        "--visible-bias", choices=("data", "zero"), default="data", help="first: log odds of the data, or 0"
+    )
     parser.add_argument("--only", choices=tuple(CASES))
     parser.add_argument("--chains", type=int, default=100, help="of AIS")
     parser.add_argument("--betas", type=int, default=10_000, help="of AIS")
@@ -106,7 +110,11 @@ def main() -> None:
     for name, centring in CASES.items():
         if given.only in (None, name):
             rbm, seconds = trained(data, given, centring)
-            found = {"case": name, "hidden": given.hidden, "passes": given.passes, "seconds": round(seconds, 1)}
+            settings = {
+                "case": name,
+                **{k: getattr(given, k) for k in ("hidden", "passes", "visible_bias", "seed")},
+            }
+            found = {**settings, "seconds": round(seconds, 1)}
             line = json.dumps({**found, **measured(rbm, data, given)})
             print(line.ljust(60))
             if given.output:
