@@ -67,14 +67,13 @@ class GradientBias(EveryIterations):
         # Enumeration draws nothing; the protocol of samplers asks for a stream.
         generator = rng.stream(0, "gradient_bias")
         exact = Exact(max_units=MAX_UNITS).sample(rbm, NoState(), positive, generator=generator).configurations
-        found, wanted = gradient(rbm, positive, negative), gradient(rbm, positive, exact)
-        log_scalars(
-            pl_module,
-            {
-                "gradient_bias/cosine": torch.cosine_similarity(found, wanted, dim=-1),
-                "gradient_bias/relative_error": (found - wanted).norm(dim=-1) / wanted.norm(dim=-1),
-            },
-        )
+        cosine, error = compared(gradient(rbm, positive, negative), gradient(rbm, positive, exact))
+        log_scalars(pl_module, {"gradient_bias/cosine": cosine, "gradient_bias/relative_error": error})
+
+
+def compared(found: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine of two gradients and relative error of the first, ``(*replicas,)`` each."""
+    return torch.cosine_similarity(found, wanted, dim=-1), (found - wanted).norm(dim=-1) / wanted.norm(dim=-1)
 
 
 def gradient(rbm: Any, positive: Configurations, negative: Configurations) -> Tensor:

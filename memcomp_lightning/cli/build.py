@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -174,13 +175,12 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
 def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
     """The sampler; the schedule of mode assistance spans all updates of a layer unless it says otherwise."""
     settings = copy.deepcopy(config.sampler)
-    schedule = settings.get("schedule")
+    schedule, size = settings.get("schedule"), config.pretrain.batch_size or data.n_train
     if schedule is not None and schedule.get("n_updates") is None:
-        size = config.pretrain.batch_size or data.n_train
         schedule.n_updates = config.pretrain.iterations * math.ceil(data.n_train / size)
     sampler = instantiate(settings)
     if isinstance(sampler, ModeAssisted):
-        chunk, size = config.data.chunk_size, config.pretrain.batch_size or data.n_train
+        chunk = config.data.chunk_size
         remedy = "Each chunk would toss the coin for itself: raise data.chunk_size or lower pretrain.batch_size."
         require(chunk >= size, "data.chunk_size", chunk, f"at least the {size} images of an update", remedy)
     return sampler
@@ -215,7 +215,12 @@ def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> 
 
 
 def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
-    return [instantiate(callback) for callback in config.callbacks[stage].values() if callback is not None]
+    return [instantiate(callback) for callback in given(config.callbacks[stage])]
+
+
+def given(callbacks: Mapping[Any, Any]) -> list[Any]:
+    """Settings of the callbacks of a stage, without those that are left out."""
+    return [callback for callback in callbacks.values() if callback is not None]
 
 
 _PRECISIONS = {"64-true": torch.float64, "16-true": torch.float16, "bf16-true": torch.bfloat16}

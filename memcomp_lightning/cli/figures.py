@@ -10,12 +10,11 @@ from typing import Any
 from hydra import compose
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
-from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.build import build, given
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
-from memcomp_lightning.cli.workers import runner
+from memcomp_lightning.cli.workers import run_all, runner
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.report import Plan, Records
@@ -32,17 +31,8 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
     with runner(config.figure.workers, config.trainer.accelerator, run_unit) as run:
         for choosing in (True, False):
             units = plan_units(config, composed, records, choosing=choosing)
-            if not units:
-                continue
-            with tqdm(total=sum(unit.n_updates for unit in units), unit="update", unit_scale=True) as bar:
-                bar.set_description(config.figure.name)
-
-                def show(what: str, n_updates: int, bar: "tqdm[Any]" = bar) -> None:
-                    bar.set_description(f"{config.figure.name}: {what}", refresh=False)
-                    bar.update(n_updates)
-
-                for found in run(units, show):
-                    records.append(found)
+            if units:
+                run_all(run, units, records, config.figure.name)
 
 
 def _curves(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfig]:
@@ -86,8 +76,7 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _stops_early(config: DictConfig) -> bool:
-    callbacks = [callback for callback in config.callbacks.finetune.values() if callback is not None]
-    return any(callback["_target_"].endswith(".BestWeights") for callback in callbacks)
+    return any(callback["_target_"].endswith(".BestWeights") for callback in given(config.callbacks.finetune))
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LearningRateDecay, MomentumSchedule
-from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.cli.build import Plan, Stage, build, given
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, DBNPretraining, DivergedError, evaluate
 from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
@@ -49,10 +49,9 @@ class Member:
         """What networks must share to be fine-tuned as one program."""
         config = self.config
         shared = {name: config[name] for name in ("data", "finetune", "trainer")}
-        callbacks = [callback for callback in config["callbacks"]["finetune"].values() if callback is not None]
-        shared["schedules"] = [
-            c for c in callbacks if c["_target_"].endswith((".MomentumSchedule", ".LearningRateDecay"))
-        ]
+        of_rates = (".MomentumSchedule", ".LearningRateDecay")
+        callbacks = given(config["callbacks"]["finetune"])
+        shared["schedules"] = [callback for callback in callbacks if callback["_target_"].endswith(of_rates)]
         shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)
 

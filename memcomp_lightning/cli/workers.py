@@ -12,9 +12,11 @@ from functools import partial
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from memcomp_lightning.cli.units import Progress, device_of
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.report.records import JsonLines
 
 
 def _n_cores() -> int:
@@ -51,6 +53,19 @@ def runner(workers: int | None, accelerator: str, train: Callable[[Any, Progress
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def run_all(run: Runner, units: Sequence[Any], records: JsonLines[Any], name: str) -> None:
+    """Train units under one progress bar; each record is written when it exists."""
+    with tqdm(total=sum(unit.n_updates for unit in units), unit="update", unit_scale=True) as bar:
+        bar.set_description(name)
+
+        def show(what: str, n_updates: int) -> None:
+            bar.set_description(f"{name}: {what}", refresh=False)
+            bar.update(n_updates)
+
+        for found in run(units, show):
+            records.append(found)
 
 
 def _run_here(train: Any, units: Sequence[Any], progress: Progress) -> Iterator[list[Any]]:

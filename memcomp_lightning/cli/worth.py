@@ -12,15 +12,14 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
-from tqdm import tqdm
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.gradient_bias import gradient
+from memcomp_lightning.callbacks.gradient_bias import MAX_UNITS, compared, gradient
 from memcomp_lightning.cli.build import Stage, build
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.units import Progress, rates_of
-from memcomp_lightning.cli.workers import runner
+from memcomp_lightning.cli.workers import run_all, runner
 from memcomp_lightning.errors import SettingError, require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
@@ -113,17 +112,8 @@ def train_worth(config: DictConfig, overrides: Sequence[str], folder: Path) -> N
         folder / "worth.json", json.dumps(OmegaConf.to_container(config.worth, resolve=True), indent=1) + "\n"
     )
     jobs = list(_jobs(config, overrides, done={course.key for course in courses.all}))
-    with (
-        runner(config.worth.workers, "cpu", run_job) as run,
-        tqdm(total=sum(job.n_updates for job in jobs), unit="update", unit_scale=True) as bar,
-    ):
-
-        def show(what: str, n_updates: int) -> None:
-            bar.set_description(f"{config.worth.name}: {what}", refresh=False)
-            bar.update(n_updates)
-
-        for found in run(jobs, show):
-            courses.append(found)
+    with runner(config.worth.workers, "cpu", run_job) as run:
+        run_all(run, jobs, courses, config.worth.name)
 
 
 def _jobs(config: DictConfig, overrides: Sequence[str], done: set[Any]) -> Iterator[Job]:
@@ -244,7 +234,7 @@ def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Ten
     persistent chains are is not, and a coin of small probability comes up in few of them. NaN where the smaller
     layer is too large.
     """
-    exact, generator = Exact(max_units=16), rng.stream(done.number, "gradient bias")
+    exact, generator = Exact(max_units=MAX_UNITS), rng.stream(done.number, "gradient bias")
     if min(rbm.n_visible, rbm.n_hidden) > exact.max_units:
         nothing = torch.full(rbm.replicas, math.nan)
         return nothing, nothing
@@ -256,8 +246,7 @@ def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Ten
 
     true = of(exact, exact.init(rbm, 1, generator=generator))
     mean = torch.stack([of(sampler, done.state) for _ in range(1 if sampler.shared else n_draws)]).mean(0)
-    cosine = torch.cosine_similarity(mean, true, dim=-1)
-    return cosine, (mean - true).norm(dim=-1) / true.norm(dim=-1)
+    return compared(mean, true)
 
 
 def _dbn(network: torch.nn.Module) -> DBN:

@@ -1,5 +1,6 @@
 """Grey values as inputs, or bits made of them."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,7 +14,7 @@ Pixels = Literal["grey", "threshold", "stochastic"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GreySource:
+class GreySource(ABC):
     """What all sources of grey images share: what their inputs are.
 
     Args:
@@ -33,9 +34,9 @@ class GreySource:
         require(0 <= self.threshold < 1, "threshold", self.threshold, "a number in [0, 1)")
         require_count("seed", self.seed, minimum=0)
 
+    @abstractmethod
     def load_grey(self) -> ImageData:
         """Return the images in grey."""
-        raise NotImplementedError
 
     def load(self) -> ImageData:
         """Return the images.
