@@ -4,34 +4,37 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.gradient_bias import MAX_UNITS, compared, gradient
-from memcomp_lightning.cli.build import Stage, build
+from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.units import Progress, rates_of
 from memcomp_lightning.cli.workers import run_all, runner
+from memcomp_lightning.cli.worth_measures import (
+    MEASURES,
+    gradient_bias,
+    mean_gradient,
+    measure_of,
+    without_diverged,
+)
 from memcomp_lightning.errors import SettingError, require, require_choice, require_count
-from memcomp_lightning.files import write_text
-from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
+from memcomp_lightning.files import write_text, written_whole
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules import DBNPretraining, DivergedError
-from memcomp_lightning.modules.stage import LARGEST_WEIGHT
-from memcomp_lightning.replicas import Pass, pretrain_layer, stacked
-from memcomp_lightning.report.worth import Course, Courses
-from memcomp_lightning.samplers import Exact, positive_phase
+from memcomp_lightning.replicas import pretrain_layer, stacked
+from memcomp_lightning.report.worth import Course, Courses, weights_path
+from memcomp_lightning.samplers import positive_phase
 
-DATA_SETTINGS = ("label", "overrides", "passes", "measure")
-METHOD_SETTINGS = ("label", "overrides", "longer")
+DATA_SETTINGS = ("label", "overrides", "passes", "measure", "methods", "rates", "replicas", "choosing", "points")
+METHOD_SETTINGS = ("label", "overrides", "longer", "rates")
 
 
 @dataclass(frozen=True)
@@ -42,21 +45,30 @@ class Job:
         data_set: Name of the data set.
         method: Name of the method.
         rate: Learning rate of the first update.
+        folder: Of the run: final weights go there.
         config: Settings as plain values, those of a single run.
-        n_replicas: Seeds 0 to n - 1, side by side.
+        n_reported: Seeds 0 to n - 1, side by side.
+        n_choosing: Further seeds, scored on images that the reported ones do not see where there are such.
         points: Passes after which the RBMs are measured.
-        measure: ``kl`` or ``log_likelihood``.
+        measure: A key of ``MEASURES``.
         gradient_draws: Draws of the negative phase whose mean gradient is compared with the exact one.
     """
 
     data_set: str
     method: str
     rate: float
+    folder: str
     config: dict[str, Any]
-    n_replicas: int
+    n_reported: int
+    n_choosing: int
     points: tuple[int, ...]
     measure: str
     gradient_draws: int
+
+    @property
+    def n_replicas(self) -> int:
+        """All of them."""
+        return self.n_reported + self.n_choosing
 
     @property
     def n_updates(self) -> int:
@@ -78,8 +90,8 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     worth = config.worth
     if config.figure is not None:
         raise UserError(
-            "preset=quick is one of figures: make the comparison smaller with worth.rates=[...], worth.replicas=N "
-            "or ~worth.data_sets.NAME."
+            "preset=quick is one of figures: make the comparison smaller with worth.only=[DATA_SET], "
+            "worth.replicas=N or worth.methods.NAME.rates=[...]."
         )
     for key in ("replicas", "choosing", "points", "gradient_draws"):
         require_count(f"worth.{key}", worth[key])
@@ -88,21 +100,32 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         for name, settings in worth[kind].items():
             for key in settings:
                 require_choice(f"setting of worth.{kind}.{name}", str(key), known)
+            for key in ("methods", "rates"):
+                found = settings.get(key, ["one"])
+                require(len(found) > 0, f"worth.{kind}.{name}.{key}", list(found), "at least one, or leave it out")
     for name, data_set in worth.data_sets.items():
-        require_choice(f"worth.data_sets.{name}.measure", data_set.measure, tuple(_MEASURES))
+        require_choice(f"worth.data_sets.{name}.measure", data_set.measure, tuple(MEASURES))
+        for method in data_set.get("methods", ()):
+            require_choice(f"worth.data_sets.{name}.methods", method, tuple(worth.methods))
+    for name in worth.only or ():
+        require_choice("worth.only", name, tuple(worth.data_sets))
     for name in (*worth.claimed, *worth.baselines):
         require_choice("worth.claimed and worth.baselines", name, tuple(worth.methods))
     if worth.workers is not None:
         require_count("worth.workers", worth.workers)
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
-    for job in _jobs(config, overrides, done=set()):
+    seen: set[tuple[str, str]] = set()
+    for job in _jobs(config, overrides, Path(), done=set()):
         plan = build(OmegaConf.create(job.config))
         stage, rbm = plan.pretraining, _dbn(plan.network)[0]
         assert stage is not None
         partitions = stage.data.replicas
         require(partitions == (), "data.partitions", partitions, "1: replicas are seeds here")
-        if job.rate == worth.rates[0]:
-            _MEASURES[job.measure](stage)(rbm)
+        if (job.data_set, job.method) not in seen:
+            seen.add((job.data_set, job.method))
+            measure = measure_of(job.measure, stage.data, 1)
+            if job.measure != "ais":  # which refuses no RBM, and takes its time
+                measure(stacked([rbm], ()))
 
 
 def train_worth(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
@@ -111,20 +134,24 @@ def train_worth(config: DictConfig, overrides: Sequence[str], folder: Path) -> N
     write_text(
         folder / "worth.json", json.dumps(OmegaConf.to_container(config.worth, resolve=True), indent=1) + "\n"
     )
-    jobs = list(_jobs(config, overrides, done={course.key for course in courses.all}))
+    (folder / "weights").mkdir(exist_ok=True)
+    jobs = list(_jobs(config, overrides, folder, done={course.key for course in courses.all}))
     with runner(config.worth.workers, "cpu", run_job) as run:
         run_all(run, jobs, courses, config.worth.name)
 
 
-def _jobs(config: DictConfig, overrides: Sequence[str], done: set[Any]) -> Iterator[Job]:
+def _jobs(config: DictConfig, overrides: Sequence[str], folder: Path, done: set[Any]) -> Iterator[Job]:
     worth = config.worth
-    for data_name, data_set in worth.data_sets.items():
-        for method_name, method in worth.methods.items():
+    for data_name in worth.only or worth.data_sets:
+        data_set = worth.data_sets[data_name]
+        n_reported, n_choosing, n_points = (data_set.get(k, worth[k]) for k in ("replicas", "choosing", "points"))
+        for method_name in data_set.get("methods", worth.methods):
+            method = worth.methods[method_name]
             passes = max(1, round(data_set.passes * method.get("longer", 1)))
             composed = composed_for(
                 tuple(overrides), (*data_set.overrides, *method.overrides, *_run_settings(passes))
             )
-            for rate in worth.rates:
+            for rate in data_set.get("rates", method.get("rates", worth.rates)):
                 if (data_name, method_name, rate) in done:
                     continue
                 own: Any = OmegaConf.to_container(composed, resolve=False)
@@ -133,9 +160,11 @@ def _jobs(config: DictConfig, overrides: Sequence[str], done: set[Any]) -> Itera
                     str(data_name),
                     str(method_name),
                     float(rate),
+                    str(folder),
                     own,
-                    worth.replicas + worth.choosing,
-                    _points(passes, worth.points),
+                    n_reported,
+                    n_choosing,
+                    _points(passes, n_points),
                     data_set.measure,
                     worth.gradient_draws,
                 )
@@ -161,7 +190,7 @@ def _points(passes: int, n: int) -> tuple[int, ...]:
 def run_job(job: Job, progress: Progress) -> list[Course]:
     """Train the replicas of a job side by side and measure them; measurements do not count as time.
 
-    On one thread: seconds of different methods are compared.
+    On one thread, and seconds are those of the processor: methods are compared by them while others run beside.
     """
     torch.set_num_threads(1)
     config = OmegaConf.create(job.config)
@@ -175,6 +204,7 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
     assert isinstance(module, DBNPretraining)
     dbn = stacked([_dbn(plan.network) for plan in plans], ())
     batches = stage.data.train_batches(0, 1).repeated(range(job.n_replicas))
+    _warm_up(dbn[0], module.sampler, next(iter(batches)).v)
     passes = pretrain_layer(
         dbn,
         0,
@@ -185,85 +215,46 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
         centring=module.centring,
         generator=rng.stream(0, "negative_phase"),
     )
-    measure, seconds, begin, reported = _MEASURES[job.measure](stage), 0.0, time.perf_counter(), 0
-    course = Course(job.data_set, job.method, job.rate, [], [], [], [], [])
+    measure, seconds = measure_of(job.measure, stage.data, job.n_reported), 0.0
+    begin, reported = time.process_time(), 0
+    course = Course(job.data_set, job.method, job.rate)
     updates_a_pass = sum(batch.closes_step for batch in batches)
     try:
         for done in passes:
             if done.number not in job.points:
                 continue
-            seconds += time.perf_counter() - begin
-            progress(f"{job.title}, update {done.number} of {job.points[-1]}", done.number - reported)
+            seconds += time.process_time() - begin
+            progress(f"{job.title}, pass {done.number} of {job.points[-1]}", done.number - reported)
             reported = done.number
             rbm, diverged = without_diverged(dbn[0])
-            cosine, error = gradient_bias(rbm, module.sampler, done, job.gradient_draws)
-            score = measure(rbm).double().masked_fill(diverged, math.inf)
-            course.updates.append(done.number * updates_a_pass)
-            course.seconds.append(seconds)
-            course.scores.append(score.tolist())
-            course.cosines.append(cosine.tolist())
-            course.errors.append(error.tolist())
-            begin = time.perf_counter()
+            course.add(
+                done.number * updates_a_pass,
+                seconds,
+                [
+                    None if values is None else values.double().masked_fill(diverged, math.inf).tolist()
+                    for values in measure(rbm)
+                ],
+                [values.tolist() for values in gradient_bias(rbm, module.sampler, done, job.gradient_draws)],
+            )
+            begin = time.process_time()
     except (DivergedError, SettingError):  # the second is a solver's that is given NaN
-        for updates in job.points[len(course.updates) :]:
-            course.updates.append(updates * updates_a_pass)
-            course.seconds.append(seconds)
-            course.scores.append([math.inf] * job.n_replicas)
-            course.cosines.append([math.nan] * job.n_replicas)
-            course.errors.append([math.nan] * job.n_replicas)
+        worst, nothing = [math.inf] * job.n_replicas, [math.nan] * job.n_replicas
+        scores = [worst, worst if job.measure == "ais" else None]
+        for point in job.points[len(course.updates) :]:
+            course.add(point * updates_a_pass, seconds, scores, [nothing, nothing])
+    with written_whole(weights_path(Path(job.folder), course)) as path:
+        torch.save(dbn[0].state_dict(), path)
     return [course]
 
 
-@torch.no_grad()
-def without_diverged(rbm: RBM) -> tuple[RBM, Tensor]:
-    """A copy in which replicas that left the finite numbers are zero, and which they are, ``(*replicas,)``."""
-    n = len(rbm.replicas)
-    largest = torch.stack([p.flatten(n).abs().amax(-1).nan_to_num(nan=math.inf) for p in rbm.parameters()]).amax(0)
-    diverged = largest > LARGEST_WEIGHT
-    kept = copy.deepcopy(rbm)
-    for parameter in kept.parameters():
-        parameter.masked_fill_(diverged.view((*diverged.shape, *[1] * (parameter.ndim - n))), 0.0)
-    return kept, diverged
-
-
-@torch.no_grad()
-def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Tensor, Tensor]:
-    """Cosine and relative error of a sampler's mean gradient against the exact one, ``(*replicas,)`` each.
-
-    Of the mean over some draws from the sampler's present state: noise of the draws is small in it, that of where
-    persistent chains are is not, and a coin of small probability comes up in few of them. NaN where the smaller
-    layer is too large.
-    """
-    exact, generator = Exact(max_units=MAX_UNITS), rng.stream(done.number, "gradient bias")
-    if min(rbm.n_visible, rbm.n_hidden) > exact.max_units:
-        nothing = torch.full(rbm.replicas, math.nan)
-        return nothing, nothing
-    positive = positive_phase(rbm, done.positive.v)
-
-    def of(sampler: Any, state: Any) -> Tensor:
-        negative = sampler.sample(rbm, state, positive, generator=generator).configurations
-        return gradient(rbm, positive, negative).double()
-
-    true = of(exact, exact.init(rbm, 1, generator=generator))
-    mean = torch.stack([of(sampler, done.state) for _ in range(1 if sampler.shared else n_draws)]).mean(0)
-    return compared(mean, true)
+def _warm_up(rbm: RBM, sampler: Any, v: torch.Tensor) -> None:
+    """Compile and load what the first updates need, outside the time that is compared."""
+    positive, generator = positive_phase(rbm, v), rng.stream(0, "warm-up")
+    state = sampler.init(rbm, v.shape[-2], generator=generator)
+    mean_gradient(copy.deepcopy(rbm), sampler, state, positive, 1, generator=generator)
 
 
 def _dbn(network: torch.nn.Module) -> DBN:
     require(isinstance(network, DBN), "model", type(network).__name__, "a DBN (model=dbn)")
     assert isinstance(network, DBN)
     return network
-
-
-def _kl(stage: Stage) -> Callable[[RBM], Tensor]:
-    v = stage.data.images.train_v
-    return lambda rbm: kl_divergence(rbm, v)
-
-
-def _log_likelihood(stage: Stage) -> Callable[[RBM], Tensor]:
-    """Negative, so that less is better, as for the divergence: nats an image."""
-    v = stage.data.images.test_v
-    return lambda rbm: -log_likelihood(rbm, v, log_partition_function(rbm)).mean(-1)
-
-
-_MEASURES = {"kl": _kl, "log_likelihood": _log_likelihood}

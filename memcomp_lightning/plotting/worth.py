@@ -40,7 +40,7 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
             bias.plot(course.updates, np.nanmedian(cosines, axis=1), **style)
     measure = "KL divergence of the data, nats" if settings["measure"] == "kl" else "negative log-likelihood, nats"
     by_update.set(xlabel="updates", ylabel=measure, xscale="log")
-    by_time.set(xlabel=f"seconds of {worth.plan['replicas'] + worth.plan['choosing']} replicas", xscale="log")
+    by_time.set(xlabel="seconds of all replicas on one thread", xscale="log")
     bias.set(xlabel="updates", ylabel="cosine of the mean gradient with the exact one", xscale="log")
     for axes in (by_update, by_time):
         if _finite_range(axes) and settings["measure"] == "kl":

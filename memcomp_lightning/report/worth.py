@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,22 +26,39 @@ class Course:
         seconds: Seconds of training until then, of all replicas side by side.
         scores: Divergence or negative log-likelihood in nats, by measurement and replica: less is better.
         cosines: Cosine of the mean gradient with the exact one, likewise.
+        reverse: Scores by the partition function of reverse AIS, likewise; empty where it is not estimated.
+        cosines: Cosine of the mean gradient with the exact one, likewise.
         errors: Relative error of the mean gradient, likewise.
     """
 
     data_set: str
     method: str
     rate: float
-    updates: list[int]
-    seconds: list[float]
-    scores: list[list[float]]
-    cosines: list[list[float]]
-    errors: list[list[float]]
+    updates: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    scores: list[list[float]] = field(default_factory=list)
+    reverse: list[list[float]] = field(default_factory=list)
+    cosines: list[list[float]] = field(default_factory=list)
+    errors: list[list[float]] = field(default_factory=list)
 
     @property
     def key(self) -> tuple[str, str, float]:
         """What tells it from the others."""
         return self.data_set, self.method, self.rate
+
+    def add(
+        self, updates: int, seconds: float, scores: Sequence[list[float] | None], bias: Sequence[list[float]]
+    ) -> None:
+        """Append a measurement: the scores with those by reverse AIS, cosines and errors."""
+        values, reverse = scores
+        assert values is not None
+        self.updates.append(updates)
+        self.seconds.append(seconds)
+        self.scores.append(values)
+        if reverse is not None:
+            self.reverse.append(reverse)
+        for kept, new in zip((self.cosines, self.errors), bias, strict=True):
+            kept.append(new)
 
 
 class Courses(JsonLines[Course]):
@@ -51,12 +68,26 @@ class Courses(JsonLines[Course]):
         super().__init__(folder / "courses.jsonl", Course)
 
 
+def weights_path(folder: Path, course: Course) -> Path:
+    """Final weights of a course: a state dict of the RBM with its replicas, the reported ones first."""
+    return folder / "weights" / f"{course.data_set}-{course.method}-{course.rate:g}.pt"
+
+
 class End(NamedTuple):
-    """A method at its best learning rate after its last update: nats, less is better."""
+    """A method at its best learning rate after its last update: nats, less is better.
+
+    Attributes:
+        rate: The learning rate.
+        median: Over the reported replicas.
+        worst: Of them.
+        reverse: Median by reverse AIS; None where it is not estimated.
+        seconds: Of training, all replicas.
+    """
 
     rate: float
     median: float
     worst: float
+    reverse: float | None
     seconds: float
 
 
@@ -79,74 +110,109 @@ class Worth:
         """Those that were measured on a data set, in the order of the legend."""
         return [name for name in self.plan["methods"] if (data_set, name) in self._courses]
 
+    def n_reported(self, data_set: str) -> int:
+        """Replicas of a data set that are reported."""
+        n: int = self.plan["data_sets"][data_set].get("replicas", self.plan["replicas"])
+        return n
+
+    def rates(self, data_set: str, method: str) -> list[float]:
+        """Learning rates that were tried."""
+        return sorted(course.rate for course in self._courses[data_set, method])
+
     def best(self, data_set: str, method: str) -> Course:
         """The course of lowest median at the end, by the replicas that choose."""
-        return min(self._courses[data_set, method], key=lambda course: float(np.median(self._choosing(course))))
+        return min(self._courses[data_set, method], key=self._chosen_by)
 
     def values(self, course: Course, name: str = "scores") -> NDArray[np.float64]:
         """``(n_points, replicas)`` of the replicas that are reported."""
-        return np.array(getattr(course, name), dtype=float)[:, : self.plan["replicas"]]
+        return np.array(getattr(course, name), dtype=float)[:, : self.n_reported(course.data_set)]
 
-    def _choosing(self, course: Course) -> NDArray[np.float64]:
-        return np.array(course.scores[-1], dtype=float)[self.plan["replicas"] :]
+    def _chosen_by(self, course: Course) -> float:
+        return float(np.median(course.scores[-1][self.n_reported(course.data_set) :]))
 
     def end(self, data_set: str, method: str) -> End:
         """What is reported of a method."""
         course = self.best(data_set, method)
         scores = self.values(course)[-1]
-        return End(course.rate, float(np.median(scores)), float(scores.max()), course.seconds[-1])
+        reverse = float(np.median(self.values(course, "reverse")[-1])) if course.reverse else None
+        return End(course.rate, float(np.median(scores)), float(scores.max()), reverse, course.seconds[-1])
 
     def opponent(self, data_set: str, method: str) -> str | None:
-        """The best baseline that takes at most a tenth more time, by the replicas that choose."""
-        limit = 1.1 * self.end(data_set, method).seconds
-        measured = self.methods(data_set)
-        able = [
-            name
+        """The best baseline, by the replicas that choose, of those that take at most a tenth more time.
+
+        The quickest one always counts; None if no baseline was measured.
+        """
+        seconds = {
+            name: self.end(data_set, name).seconds
             for name in self.plan["baselines"]
-            if name in measured and self.end(data_set, name).seconds <= limit
-        ]
-        return min(able, key=lambda n: float(np.median(self._choosing(self.best(data_set, n)))), default=None)
+            if name in self.methods(data_set)
+        }
+        if not seconds:
+            return None
+        limit = max(1.1 * self.end(data_set, method).seconds, min(seconds.values()))
+        able = [name for name in seconds if seconds[name] <= limit]
+        best: str = min(able, key=lambda name: self._chosen_by(self.best(data_set, name)))
+        return best
 
 
 WORTH_RULE = (
     "Learning rates and opponents are chosen by replicas that are not reported. A method is better if its median "
-    "is lower (Mann-Whitney, two-sided, p < .05) and its worst replica is no worse than that of the best baseline "
-    "which takes at most a tenth more time."
+    "is lower (Mann-Whitney, two-sided, p < .05 after Holm's correction for all lines of this table) and its "
+    "worst replica no worse than that of the best baseline which takes at most a tenth more time (or, where none "
+    "does, of the quickest)."
 )
 
 
 def worth_verdicts(worth: Worth) -> list[Verdict]:
     """Judge the claimed methods on each data set."""
-    found = []
-    for data_set in worth.data_sets:
-        for method in worth.plan["claimed"]:
-            if method not in worth.methods(data_set) or (opponent := worth.opponent(data_set, method)) is None:
-                continue
-            mine, other = worth.end(data_set, method), worth.end(data_set, opponent)
-            scores = [worth.values(worth.best(data_set, name))[-1] for name in (method, opponent)]
-            p = float(stats.mannwhitneyu(*scores).pvalue)
-            better = mine.median < other.median and p < 0.05 and mine.worst <= other.worst
-            measured = f"{mine.median:.4g} (worst {mine.worst:.4g}) against {other.median:.4g} ({other.worst:.4g})"
-            label, against = (worth.plan["methods"][name]["label"] for name in (method, opponent))
-            found.append(
-                Verdict(
-                    f"{worth.plan['data_sets'][data_set]['label']}: {label} beats {against}",
-                    f"median {measured}",
-                    f"{mine.seconds:.1f} s and {other.seconds:.1f} s, p = {p:.2g}",
-                    HOLDS if better else FAILS,
-                )
-            )
-    return found
+    pairs = [
+        (data_set, method, opponent)
+        for data_set in worth.data_sets
+        for method in worth.plan["claimed"]
+        if method in worth.methods(data_set) and (opponent := worth.opponent(data_set, method)) is not None
+    ]
+    scores = [tuple(worth.values(worth.best(pair[0], name))[-1] for name in pair[1:]) for pair in pairs]
+    p_values = holm([float(stats.mannwhitneyu(*pair).pvalue) for pair in scores])
+    return [_verdict(worth, *pair, p) for pair, p in zip(pairs, p_values, strict=True)]
+
+
+def _verdict(worth: Worth, data_set: str, method: str, opponent: str, p: float) -> Verdict:
+    mine, other = worth.end(data_set, method), worth.end(data_set, opponent)
+    better = mine.median < other.median and p < 0.05 and mine.worst <= other.worst
+    measured = f"{mine.median:.4g} (worst {mine.worst:.4g}) against {other.median:.4g} ({other.worst:.4g})"
+    label, against = (worth.plan["methods"][name]["label"] for name in (method, opponent))
+    return Verdict(
+        f"{worth.plan['data_sets'][data_set]['label']}: {label} beats {against}",
+        f"median {measured}",
+        f"{mine.seconds:.1f} s and {other.seconds:.1f} s, p = {p:.2g}",
+        HOLDS if better else FAILS,
+    )
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p values for testing several hypotheses (Holm 1979): the family-wise error stays below the level.
+
+    >>> holm([0.01, 0.5, 0.02])
+    [0.03, 0.5, 0.04]
+    """
+    adjusted, largest = [0.0] * len(p_values), 0.0
+    for rank, index in enumerate(np.argsort(p_values)):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[index]))
+        adjusted[index] = largest
+    return adjusted
 
 
 def worth_table(worth: Worth) -> list[list[str]]:
     """A row for each data set and method, with a header."""
-    rows = [["data set", "method", "best rate", "median", "worst", "seconds", "us an update and replica"]]
+    header = ["data set", "method", "best rate", "tried", "median", "worst", "median by reverse AIS", "seconds"]
+    rows = [[*header, "us an update and replica"]]
     for data_set in worth.data_sets:
         for method in worth.methods(data_set):
             end, course = worth.end(data_set, method), worth.best(data_set, method)
             each = 1e6 * end.seconds / course.updates[-1] / len(course.scores[-1])
-            cells = [f"{end.median:.4g}", f"{end.worst:.4g}", f"{end.seconds:.1f}", f"{each:.1f}"]
+            tried = " ".join(f"{rate:g}" for rate in worth.rates(data_set, method))
+            reverse = "" if end.reverse is None else f"{end.reverse:.4g}"
+            cells = [tried, f"{end.median:.4g}", f"{end.worst:.4g}", reverse, f"{end.seconds:.1f}", f"{each:.1f}"]
             labels = [
                 worth.plan[kind][name]["label"] for kind, name in (("data_sets", data_set), ("methods", method))
             ]

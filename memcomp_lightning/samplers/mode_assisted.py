@@ -110,6 +110,13 @@ class ModeAssisted:
         if float(rng.uniform((), generator=generator)) >= probability:
             found = self.inner.sample(model, state.inner, positive, generator=generator)
             return found._replace(state=state._replace(inner=found.state))
+        return self.sample_mode(model, state, positive, generator=generator)
+
+    @torch.no_grad()
+    def sample_mode(
+        self, model: SizedModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
+    ) -> NegativePhase[ModeAssistedState]:
+        """Return the negative phase of an update with the mode, whatever the schedule says; counts nothing."""
         found = self.mode.sample(model, state.mode, positive, generator=generator)
         scale = mode_scale(model, found.configurations)
         mixed = _mixture(found.configurations, positive, scale)

@@ -4,28 +4,34 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from running import Outcome
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from memcomp_lightning.data import ShiftingBars
-from memcomp_lightning.likelihood import kl_divergence
-from memcomp_lightning.models import DBN
-from memcomp_lightning.report.worth import Courses, read_worth
+from memcomp_lightning import rng
+from memcomp_lightning.callbacks.gradient_bias import gradient
+from memcomp_lightning.cli.worth_measures import mean_gradient
+from memcomp_lightning.data import Digits, ImageDataModule, ShiftingBars
+from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
+from memcomp_lightning.models import DBN, RBM, Gaussian
+from memcomp_lightning.qubo import BruteForce
+from memcomp_lightning.report.worth import Courses, read_worth, weights_path
+from memcomp_lightning.samplers import Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
 
 Run = Callable[..., Outcome]
 KEPT = ("cd1", "cd1_long", "exact", "mode_cd_exact")
-ALL = ("cd10", "pcd", "pcd_long", "pt", "mode_cd_dmm", "mode_cd_sa", "mode_pcd_exact", "mode_pcd_dmm")
 SMALL = [
     "experiment=sampler_worth",
-    *[f"~worth.methods.{name}" for name in (*ALL, "ground_state", "time_average")],
-    "~worth.data_sets.inverted_bars",
-    "~worth.data_sets.bars_and_stripes",
+    "worth.only=[shifting_bars]",
+    f"+worth.data_sets.shifting_bars.methods=[{','.join(KEPT)}]",
     "worth.data_sets.shifting_bars.passes=40",
     "worth.claimed=[mode_cd_exact]",
     "worth.baselines=[cd1,cd1_long]",
     "worth.rates=[0.1,0.5]",
+    *[f"worth.methods.{name}.rates=[0.1,0.5]" for name in ("cd1", "cd1_long", "exact")],
+    "worth.methods.exact.longer=1",
     "worth.replicas=3",
     "worth.choosing=2",
     "worth.points=4",
@@ -45,6 +51,8 @@ def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -
         assert (course.updates[0], course.updates[-1], len(course.updates)) == (1, n_passes, 4)
         assert all(len(scores) == 5 for scores in course.scores)
         assert course.seconds == sorted(course.seconds)
+        weights = torch.load(weights_path(Path("run"), course), weights_only=True)
+        assert [tuple(value.shape) for value in weights.values()] == [(5, 18, 9), (5, 9), (5, 18)]
         exact = course.method == "exact"
         assert all((error < 1e-6) == exact for error in course.errors[0])
 
@@ -69,7 +77,7 @@ def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -
 
 def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     """Of the exact gradient, which draws nothing: the fourth replica is the run with seed 3."""
-    assert memcomp_train(*SMALL, "worth.rates=[0.5]").status == 0
+    assert memcomp_train(*SMALL).status == 0
     decay = "{_target_:memcomp_lightning.callbacks.LearningRateDecay,n_passes:40}"
     single = memcomp_train(
         "data=shifting_bars",
@@ -86,7 +94,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     assert single.status == 0, single.err
     dbn = DBN(9, [18])
     dbn.load_state_dict(torch.load("single/weights/pretrain.pt", weights_only=True))
-    (course,) = [c for c in Courses(Path("run")).all if c.method == "exact"]
+    (course,) = [c for c in Courses(Path("run")).all if (c.method, c.rate) == ("exact", 0.5)]
     found = kl_divergence(dbn[0], ShiftingBars().load().train_v)
     assert course.scores[-1][3] == pytest.approx(float(found), rel=1e-4)
 
@@ -97,6 +105,9 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         ("worth.data_sets.shifting_bars.measure=accuracy", "measure = 'accuracy'"),
         ("worth.claimed=[cd2]", "'cd2'"),
         ("worth.rates=[]", "worth.rates = []"),
+        ("worth.methods.cd1.rates=[]", "worth.methods.cd1.rates = []"),
+        ("worth.only=[bars]", "worth.only = 'bars'"),
+        ("worth.data_sets.shifting_bars.measure=ais", "data.validation_fraction = 0.0"),
         ("worth.replicas=0", "worth.replicas = 0"),
         ("+worth.methods.cd1.faster=2", "setting of worth.methods.cd1 = 'faster'"),
         ("worth.methods.cd1.overrides=['sampler=cdd']", "cdd"),
@@ -115,8 +126,58 @@ def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override
 
 
 def test_divergence_is_a_result(memcomp_train: Run) -> None:
-    outcome = memcomp_train(*SMALL, "worth.rates=[1e30]")
+    outcome = memcomp_train(*SMALL, "worth.methods.cd1.rates=[1e30]")
     assert outcome.status == 0, outcome.err
     (course,) = [c for c in Courses(Path("run")).all if c.method == "cd1"]
     assert course.scores[-1] == [float("inf")] * 5
-    assert json.loads(Path("run/worth.json").read_text())["rates"] == [1e30]
+    assert json.loads(Path("run/worth.json").read_text())["methods"]["cd1"]["rates"] == [1e30]
+
+
+def test_likelihoods_are_chosen_by_held_out_images_and_bracketed(memcomp_train: Run) -> None:
+    """Exact and AIS agree on the same courses; replicas that choose are scored by other images."""
+    data = [
+        "data=digits",
+        "data.source.pixels=threshold",
+        "data.validation_fraction=0.2",
+        "pretrain.batch_size=100",
+    ]
+    data = ",".join(f"'{setting}'" for setting in (*data, "model.hidden_sizes=[8]"))
+    common = f"label:digits,passes:6,methods:[cd1],rates:[0.5],points:2,overrides:[{data}]"
+    outcome = memcomp_train(
+        *SMALL,
+        *[f"+worth.data_sets.{m}={{{common},measure:{m}}}" for m in ("log_likelihood", "ais")],
+        "worth.only=[log_likelihood,ais]",
+        "worth.claimed=[]",
+    )
+    assert outcome.status == 0, outcome.err
+    exact, ais = Courses(Path("run")).all
+    assert np.shape(exact.scores) == np.shape(ais.reverse) == (2, 5)
+    assert exact.reverse == []
+    assert np.array(ais.scores) == pytest.approx(np.array(exact.scores), abs=0.1)
+    assert np.array(ais.reverse) == pytest.approx(np.array(exact.scores), abs=0.1)
+
+    rbm = RBM(n_visible=32, n_hidden=8, replicas=(5,))
+    rbm.load_state_dict(torch.load(weights_path(Path("run"), exact), weights_only=True))
+    module = ImageDataModule(Digits(pixels="threshold").load(), batch_size=100, validation_fraction=0.2)
+    assert module.validation is not None
+    for v, at in ((module.images.test_v, slice(0, 3)), (module.validation[0], slice(3, 5))):
+        score = -log_likelihood(rbm, v, log_partition_function(rbm)).mean(-1)
+        assert exact.scores[-1][at] == pytest.approx(score[at].tolist(), rel=1e-6)
+
+
+def test_mean_gradient_of_mode_assistance_weighs_both_sides() -> None:
+    rbm = RBM(n_visible=4, n_hidden=3, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "w"))
+    exact, schedule = Exact(), ModeSchedule(n_updates=10)
+    sampler = ModeAssisted(inner=exact, mode=GroundState(solver=BruteForce()), schedule=schedule)
+    generator = rng.stream(0, "negative_phase")
+    positive = positive_phase(rbm, torch.eye(4).expand(2, 4, 4))
+    state = sampler.init(rbm, 4, generator=generator)._replace(n_done=torch.tensor(schedule.n_updates))
+    found = mean_gradient(rbm, sampler, state, positive, 3, generator=generator)
+    parts = [
+        gradient(rbm, positive, negative.configurations).double()
+        for negative in (
+            exact.sample(rbm, state.inner, positive, generator=generator),
+            sampler.sample_mode(rbm, state, positive, generator=generator),
+        )
+    ]
+    torch.testing.assert_close(found, 0.9 * parts[0] + 0.1 * parts[1], rtol=1e-5, atol=1e-9)

@@ -5,7 +5,7 @@ import pytest
 
 from memcomp_lightning import rng
 from memcomp_lightning.report.verdicts import FAILS, HOLDS
-from memcomp_lightning.report.worth import Course, Worth, worth_table, worth_verdicts
+from memcomp_lightning.report.worth import Course, Worth, holm, worth_table, worth_verdicts
 
 PLAN = {
     "replicas": 11,
@@ -23,7 +23,7 @@ def course(method, rate, reported, chosen=None, seconds=10.0):
     values = np.concatenate([np.full(11, reported), np.full(3, reported if chosen is None else chosen)]) + noise
     scores = [[1.0] * 14, values.tolist()]
     ones = [[1.0] * 14] * 2
-    return Course("bars", method, rate, [1, 100], [0.1, seconds], scores, ones, ones)
+    return Course("bars", method, rate, [1, 100], [0.1, seconds], scores, [], ones, ones)
 
 
 def test_rates_are_chosen_by_the_replicas_that_are_not_reported():
@@ -39,7 +39,8 @@ def test_the_opponent_takes_no_more_time():
     worth = Worth(PLAN, found)
     assert worth.opponent("bars", "mode") == "cd"
     assert Worth(PLAN, [*found[:2], course("mode", 0.1, 0.3, seconds=49)]).opponent("bars", "mode") == "slow"
-    assert Worth(PLAN, found[1:]).opponent("bars", "mode") is None
+    assert Worth(PLAN, found[1:]).opponent("bars", "mode") == "slow"  # the quickest there is
+    assert Worth(PLAN, found[2:]).opponent("bars", "mode") is None
 
 
 @pytest.mark.parametrize(("mode", "expected"), [(0.3, HOLDS), (0.5, FAILS), (0.7, FAILS)])
@@ -57,7 +58,12 @@ def test_one_bad_replica_is_enough_to_lose():
     assert "worst 0.9" in verdict.measured
 
 
+def test_p_values_are_adjusted_for_their_number():
+    assert holm([0.04, 0.001, 0.03]) == pytest.approx([0.06, 0.003, 0.06])
+    assert holm([0.9, 0.6]) == [1.0, 1.0]
+
+
 def test_table_has_a_row_for_each_method():
     rows = worth_table(Worth(PLAN, [course("cd", 0.1, 0.5), course("mode", 0.2, 0.3)]))
-    assert [row[:3] for row in rows[1:]] == [["bars", "CD", "0.1"], ["bars", "MODE", "0.2"]]
+    assert [row[:4] for row in rows[1:]] == [["bars", "CD", "0.1", "0.1"], ["bars", "MODE", "0.2", "0.2"]]
     assert float(rows[1][-1]) == pytest.approx(10 * 1e6 / 100 / 14, abs=0.1)
