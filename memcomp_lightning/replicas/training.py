@@ -1,8 +1,9 @@
 """The loops of pretraining and fine-tuning on the replica axis.
 
-They do what ``DBNPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and draw for
-draw: a replica here ends with the weights of the run that trains it alone. What they leave out is everything that
-looks at training, which costs more than an update of a small network.
+They do what ``DBNPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and, on the CPU,
+draw for draw: a replica here ends with the weights of the run that trains it alone. On another device chains are
+drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out is what looks
+at training, which costs more than an update of a small network.
 """
 
 from collections.abc import Callable, Iterator
@@ -86,7 +87,8 @@ def pretrain(
         DivergedError: A parameter left the finite numbers.
     """
     settings: dict[str, Any] = {"iterations": iterations, "rates": rates, "centring": centring}
-    generator = rng.stream(seed, "negative_phase")
+    # On the parameters' device: a draw from elsewhere would be copied in each update, and the copy would wait.
+    generator = rng.stream(seed, "negative_phase", device=dbn[0].b.device)
     for layer in range(len(dbn)):
         for _ in pretrain_layer(dbn, layer, batches, sampler, generator=generator, **settings):
             pass

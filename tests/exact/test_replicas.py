@@ -1,15 +1,20 @@
 """The gradient in closed form against autograd, and networks side by side against networks alone."""
 
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from memcomp_lightning import rng
+from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear
 from memcomp_lightning.modules import LOSSES, DBNClassifier, cross_entropy, score, squared_error
-from memcomp_lightning.replicas import stacked
+from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
 from memcomp_lightning.replicas.backprop import gradient_of
+from memcomp_lightning.samplers import CD, PCD, Exact
 from memcomp_lightning.types import Batch
 
 
@@ -75,6 +80,37 @@ def test_running_statistics_of_batch_normalisation_move_as_in_the_module(n):
     torch.testing.assert_close(
         next(quick.parameters()).grad, 0.7 * next(slow.parameters()).grad, rtol=1e-12, atol=1e-13
     )
+
+
+class _Reads(TorchDispatchMode):
+    """Counts what makes the host wait for a device: values read back, shapes that depend on them, copies."""
+
+    WAITING = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "_to_copy", "copy_from")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.overloadpacket.__name__
+        if name in self.WAITING and not (name == "_to_copy" and "device" not in (kwargs or {})):
+            self.found.append(name)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("sampler", [CD(k=2), PCD(n_chains=5), Exact()], ids=lambda s: type(s).__name__)
+def test_no_update_reads_anything_back(sampler):
+    """More passes, no more reads: on a GPU the host runs ahead of the device through the whole training."""
+    reads = []
+    for iterations in (2, 7):
+        network, data = classifier((2,)), batch((2,))
+        batches = Batches(data.v, data.label, batch_size=5, chunk_size=10, shuffle=True, seed=0)
+        rates = Rates(partial(torch.optim.SGD, lr=0.1), momentum=lambda done: 0.5)
+        with _Reads() as mode:
+            pretrain(network[0], batches, sampler, iterations=iterations, rates=rates)
+            list(finetune(network, batches, iterations=iterations, rates=rates))
+        reads.append(sorted(mode.found))
+    assert reads[0] == reads[1] != []  # what is left is the check at the end
 
 
 @pytest.mark.parametrize("units", ["sigmoid", "batch_norm_relu"])

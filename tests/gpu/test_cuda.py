@@ -1,5 +1,7 @@
 """The same numbers on a CUDA device, where there is one."""
 
+from functools import partial
+
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -21,6 +23,7 @@ from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, EdgeList, Qubo, WeightedMaxSat, from_model
 from memcomp_lightning.qubo.maxsat import Clauses
+from memcomp_lightning.replicas import Rates, finetune, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench, positive_phase
 from memcomp_lightning.testing.conformance import small_rbm
 
@@ -113,3 +116,24 @@ def test_likelihoods_are_the_same_on_both_devices() -> None:
         answers.append([part.cpu() for part in (v, *up, *down, *exact)])
     for cpu, cuda in zip(*answers, strict=True):
         torch.testing.assert_close(cuda, cpu)
+
+
+@pytest.mark.parametrize("sampler", [CD(k=2), PCD(n_chains=11)], ids=["CD", "PCD"])
+def test_the_host_waits_for_no_update(sampler, monkeypatch) -> None:
+    """A pass of many updates, with every synchronisation an error; its order, copied once a pass, lies ready."""
+    data = ImageDataModule(Digits().load(), batch_size=100, partitions=2)
+    dbn = DBN(32, [7, 5], replicas=(2,)).cuda()
+    network = DBNClassifier(dbn).network.cuda()
+    batches = data.train_batches(0, 1).to("cuda")
+    order = batches._order()
+    monkeypatch.setattr(batches, "_order", lambda: order)
+    rates = Rates(partial(torch.optim.SGD, lr=0.1))
+    generator = rng.stream(0, "negative_phase", device="cuda")
+    passes = pretrain_layer(dbn, 0, batches, sampler, iterations=2, rates=rates, generator=generator)
+    for training in (passes, finetune(network, batches, iterations=2, rates=rates)):
+        next(training)  # kernels are loaded
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            next(training)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
