@@ -2,8 +2,8 @@
 
 They do what ``DBNPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and, on the CPU,
 draw for draw: a replica here ends with the weights of the run that trains it alone. On another device chains are
-drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out is what looks
-at training, which costs more than an update of a small network.
+drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out looks at
+training, which costs more than an update of a small network.
 """
 
 from collections.abc import Callable, Iterator
