@@ -13,6 +13,8 @@ from tqdm.auto import tqdm
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.likelihood.boltzmann import base_on_first_class, folded
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor
@@ -79,21 +81,27 @@ class Ais:
         object.__setattr__(self, "betas", _checked(self.n_betas, self.betas, self.k))
 
     def estimate(
-        self, model: RBM, *, generator: Generator, base: Tensor | None = None, progress: bool = False
+        self,
+        model: RBM | BoltzmannMachine,
+        *,
+        generator: Generator,
+        base: Tensor | None = None,
+        progress: bool = False,
     ) -> AisEstimate:
         """Estimate log Z.
 
         Args:
-            model: The RBM, on any device.
+            model: The RBM, or a Boltzmann machine of two classes of units (a DBM), on any device.
             generator: Random stream.
             base: Visible bias b_0 of the RBM at beta = 0, ``(n_visible,)`` or ``(*replicas, n_visible)``, see
                 :func:`base_of`; None is zeros.
             progress: Show a bar.
 
         Raises:
-            SettingError: base has the wrong shape.
+            SettingError: base has the wrong shape; a machine has more than two classes.
         """
         base = _base(model, base)
+        model, base = _two_layers(model, base)
         start = torch.sigmoid(base).unsqueeze(-2).expand(*model.replicas, self.n_chains, model.n_visible)
         v = rng.bernoulli(start, generator=generator)
         log_w = _anneal(model, v, base, _schedule(self.n_betas, self.betas), self.k, generator, progress)
@@ -220,7 +228,13 @@ def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
     return model.n_hidden * log_two + F.softplus(base.double(), threshold=40.0).sum(-1)
 
 
-def _base(model: RBM, base: Tensor | None) -> Tensor:
+def _two_layers(model: RBM | BoltzmannMachine, base: Tensor) -> tuple[RBM, Tensor]:
+    if isinstance(model, BoltzmannMachine):
+        return folded(model), base_on_first_class(model, base)
+    return model, base
+
+
+def _base(model: RBM | BoltzmannMachine, base: Tensor | None) -> Tensor:
     """The base's bias for each replica."""
     shape = model.b.shape
     if base is None:

@@ -8,8 +8,14 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.likelihood.boltzmann import (
+    folded,
+    log_hidden_sum,
+    log_partition_function_by_classes,
+)
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
 
@@ -19,17 +25,18 @@ _NUMBERS = 2**23
 
 @torch.no_grad()
 def log_partition_function(
-    model: RBM, *, max_units: int = 25, progress: bool = False
+    model: RBM | BoltzmannMachine, *, max_units: int = 25, progress: bool = False
 ) -> Float[Tensor, "*replicas"]:
     r"""Return log Z, by enumerating the smaller layer.
 
     .. math:: Z = \sum_s exp(g.s) \prod_i (1 + exp(W s + c)_i)
 
     over the states s of the smaller layer, with bias g, and the units i of the other one. Time grows as
-    2^n_smaller n_other, about 5e9 such pairs a second and CPU thread.
+    2^n_smaller n_other, about 5e9 such pairs a second and CPU thread. A Boltzmann machine of two classes of units
+    is such an RBM (:func:`folded`); of any other all units outside the largest class are enumerated.
 
     Args:
-        model: The RBM, of any dtype; the sum is done in float64.
+        model: The model, of any dtype; the sum is done in float64.
         max_units: Largest smaller layer, 1 to 32.
         progress: Log an estimate of the time and show a bar.
 
@@ -42,6 +49,10 @@ def log_partition_function(
     >>> log_partition_function(RBM(n_visible=3, n_hidden=2)).shape
     torch.Size([])
     """
+    if isinstance(model, BoltzmannMachine):
+        if len(model.classes) != 2:
+            return log_partition_function_by_classes(model, max_units)
+        model = folded(model)
     layers = enumerable(model, max_units)
     return prefix_log_weights(layers, progress=progress).logsumexp(-1).reshape(model.replicas)
 
@@ -92,12 +103,15 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
 
 @torch.no_grad()
 def log_likelihood(
-    model: RBM, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
+    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
 ) -> Float[Tensor, "*replicas n"]:
     """Return log p(v) = -F(v) - log Z of each image.
 
+    In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
+    their largest class: up to 16 of them. For more, see :func:`log_likelihood_bound`.
+
     Args:
-        model: The RBM.
+        model: The model.
         v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
         log_z: Log of the partition function, exact or estimated, ``(*replicas,)``.
 
@@ -105,9 +119,11 @@ def log_likelihood(
         ``(*replicas, n)`` float64, in nats.
 
     Raises:
-        SettingError: v is not binary or has the wrong shape.
+        SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
+    if isinstance(model, BoltzmannMachine):
+        return log_hidden_sum(model, v, max_units=16) - log_z.double().unsqueeze(-1)
     weight, b, c = _double(model)
 
     def minus_free_energy(rows: Tensor) -> Tensor:
@@ -119,7 +135,9 @@ def log_likelihood(
 
 @torch.no_grad()
 def kl_divergence(
-    model: RBM, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"] | None = None
+    model: RBM | BoltzmannMachine,
+    v: Float[Tensor, "*axes n n_visible"],
+    log_z: Float[Tensor, "*replicas"] | None = None,
 ) -> Float[Tensor, "*replicas"]:
     r"""Return the divergence of the model from the empirical distribution of the rows of v.
 
@@ -185,7 +203,7 @@ def log_pseudo_likelihood(
     return _in_chunks(of_rows, v, model.n_visible * model.n_hidden)
 
 
-def _binary(model: RBM, v: Tensor) -> Tensor:
+def _binary(model: RBM | BoltzmannMachine, v: Tensor) -> Tensor:
     """Images with the model's replica axes."""
     replicas = model.replicas
     fits = v.ndim >= 2 and v.shape[-1] == model.n_visible and v.shape[:-2] in ((), replicas)

@@ -1,23 +1,32 @@
 """Energy models and networks, each a ``torch.nn.Module`` on the replica axis."""
 
+from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine
+from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
 from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier
+from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.randomise import GaussianMoments, Randomiser, Shuffled
 from memcomp_lightning.models.rbm import RBM
 
 __all__ = [
+    "DBM",
     "DBN",
     "RBM",
     "BatchNorm",
     "BatchNormReluNetwork",
+    "Block",
+    "BoltzmannMachine",
     "Gaussian",
     "GaussianMoments",
     "Initialiser",
     "Linear",
+    "MeanFieldSolution",
     "Randomiser",
     "Shuffled",
     "Uniform",
     "Xavier",
+    "hidden_blocks",
+    "mean_field",
     "with_batch_norm_relu",
 ]

@@ -2,22 +2,23 @@
 
 import torch
 
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.rbm import RBM
-from memcomp_lightning.qubo.graph import Bipartite
+from memcomp_lightning.qubo.graph import Bipartite, EdgeList, Graph
 from memcomp_lightning.qubo.qubo import Qubo
 
 
-def from_model(rbm: RBM) -> Qubo:
-    """Return the problem whose energy at x = (v, h) is E(v, h) of the RBM, one problem a replica.
+def from_model(model: RBM | BoltzmannMachine) -> Qubo:
+    """Return the problem whose energy at x = (v, h) is E(v, h) of the model, one problem a replica.
 
     >>> rbm = RBM(n_visible=3, n_hidden=2)
     >>> from_model(rbm).energy(torch.ones(1, 5)).allclose(rbm.energy(torch.ones(1, 3), torch.ones(1, 2)).double())
     True
     """
-    weight, b, c = rbm.weight.detach(), rbm.b.detach(), rbm.c.detach()
-    return Qubo(
-        graph=Bipartite(n_first=rbm.n_visible, n_second=rbm.n_hidden),
-        coupling=-weight,
-        linear=-torch.cat((b, c), dim=-1),
-        offset=weight.new_zeros(rbm.replicas),
-    )
+    graph: Graph
+    if isinstance(model, BoltzmannMachine):
+        graph, coupling = EdgeList(n=model.n_units, pairs=model.pairs), model.coupling
+    else:
+        graph, coupling = Bipartite(n_first=model.n_visible, n_second=model.n_hidden), model.weight
+    linear = torch.cat((model.b, model.c), dim=-1)
+    return Qubo(graph, -coupling.detach(), -linear.detach(), coupling.new_zeros(model.replicas))

@@ -2,6 +2,13 @@
 
 from memcomp_lightning.samplers.base import NegativePhaseSampler, tensors_of, with_tensors
 from memcomp_lightning.samplers.cd import CD
+from memcomp_lightning.samplers.clamped import (
+    ClampedGibbs,
+    ExactPosterior,
+    MeanField,
+    PositivePhase,
+    PositivePhaseSampler,
+)
 from memcomp_lightning.samplers.exact import Exact
 from memcomp_lightning.samplers.gibbs import positive_phase
 from memcomp_lightning.samplers.ground_state import GroundState
@@ -13,12 +20,17 @@ from memcomp_lightning.samplers.tempering import ParallelTempering
 __all__ = [
     "CD",
     "PCD",
+    "ClampedGibbs",
     "Exact",
+    "ExactPosterior",
     "GroundState",
+    "MeanField",
     "ModeAssisted",
     "ModeSchedule",
     "NegativePhaseSampler",
     "ParallelTempering",
+    "PositivePhase",
+    "PositivePhaseSampler",
     "Quench",
     "positive_phase",
     "tensors_of",

@@ -7,8 +7,8 @@ import torch
 from torch import Generator
 
 from memcomp_lightning import rng
-from memcomp_lightning.errors import require_choice, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel
+from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of, has_classes
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 Readout = Literal["mean", "sample"]
@@ -19,7 +19,8 @@ class CD:
     """CD-k: k Gibbs sweeps that start at the data (Hinton 2002).
 
     The hidden units of the last half sweep are kept as conditional means, which has the same expectation
-    and less variance than samples (Hinton 2010, section 3).
+    and less variance than samples (Hinton 2010, section 3). In a model of any connectivity a sweep draws class
+    by class, and the last class is kept as means.
 
     Attributes:
         k: Sweeps an update, >= 1.
@@ -40,7 +41,14 @@ class CD:
         require_choice("hidden", self.hidden, ("mean", "sample"))
 
     def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> NoState:
-        """Nothing to remember: every call starts at the data."""
+        """Nothing to remember: every call starts at the data.
+
+        Raises:
+            SettingError: Other readouts than the default ones for a model that is not drawn layer by layer.
+        """
+        for name, default in (("visible", "sample"), ("hidden", "mean")):
+            readout, allowed = getattr(self, name), f"{default!r} for a model other than an RBM"
+            require(readout == default or not has_classes(model), name, readout, allowed)
         return NoState()
 
     @torch.no_grad()
@@ -48,6 +56,12 @@ class CD:
         self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration an image, k sweeps away from it."""
+        if has_classes(model):
+            chains = chains_of(model)
+            x = torch.cat((positive.v, rng.bernoulli(positive.h, generator=generator)), dim=-1)
+            for _ in range(self.k):
+                x = chains.sweep(x, generator=generator)
+            return NegativePhase(chains.read(x), state, {})
         # The first half sweep takes the hidden means that the positive phase has computed already.
         h = rng.bernoulli(positive.h, generator=generator)
         for _ in range(self.k - 1):

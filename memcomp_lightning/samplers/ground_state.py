@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.qubo.from_model import from_model
 from memcomp_lightning.qubo.qubo import QuboSolution, QuboSolver, Status
@@ -41,20 +42,20 @@ class GroundState:
                 "Use DmmSolver(record=Recording(every=8)), or readout = 'best'.",
             )
 
-    def init(self, model: RBM, n_chains: int, *, generator: Generator) -> NoState:
+    def init(self, model: RBM | BoltzmannMachine, n_chains: int, *, generator: Generator) -> NoState:
         """Nothing to remember: every update solves a new problem."""
         return NoState()
 
     @torch.no_grad()
     def sample(
-        self, model: RBM, state: NoState, positive: Configurations, *, generator: Generator
+        self, model: RBM | BoltzmannMachine, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return x* or the weighted trajectory."""
         solution = self.solver.minimise(from_model(model), generator=generator)
         if self.readout == "best":
             x, weight = solution.best.unsqueeze(-2), None
         else:
-            x, weight = _visited(solution, model.weight.dtype)
+            x, weight = _visited(solution, model.b.dtype)
         v, h = x.split((model.n_visible, model.n_hidden), dim=-1)
         return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
 

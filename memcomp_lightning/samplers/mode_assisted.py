@@ -1,6 +1,7 @@
 """Mode-assisted training: now and then the ground state takes the place of another sampler's negative phase."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -16,11 +17,10 @@ from memcomp_lightning.types import Configurations, NegativePhase
 
 
 class SizedModel(TemperedModel, Protocol):
-    """A two-layer model with the energy of joint states and the sizes of both layers."""
+    """A model with the energy of joint states and its parameters."""
 
-    @property
-    def n_hidden(self) -> int:
-        """Number of hidden units."""
+    def parameters(self) -> Iterator[Any]:
+        """Couplings and biases."""
         ...
 
 
@@ -74,9 +74,11 @@ class ModeAssisted:
     .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
 
     with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state in units
-    of the largest that couplings of one can give. The scaled update is written as a negative phase: x* has the
-    weight g, the positive phase keeps 1 - g. One coin serves all replicas, so that a ground state is computed only
-    when it is used. The coin is tossed and counted once a call: give all images of an update at once.
+    of the largest that couplings of one can give. In a model of any connectivity the number of couplings and
+    biases, plus one, stands for :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM. The scaled
+    update is written as a negative phase: x* has the weight g, the positive phase keeps 1 - g. One coin serves all
+    replicas, so that a ground state is computed only when it is used. The coin is tossed and counted once a call:
+    give all images of an update at once.
 
     Attributes:
         inner: Sampler of the other updates.
@@ -128,7 +130,9 @@ def mode_scale(model: SizedModel, mode: Configurations) -> Tensor:
     """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1]; the lowest energy counts."""
     half_v, half_h = (torch.full_like(x[..., :1, :], 0.5) for x in (mode.v, mode.h))
     depth = model.energy(half_v, half_h).squeeze(-1) - model.energy(mode.v, mode.h).amin(-1)
-    return (depth / (4 * (model.n_visible + 1) * (model.n_hidden + 1))).clamp(0.0, 1.0)
+    n_terms = 1 + sum(parameter.numel() for parameter in model.parameters()) // max(1, math.prod(model.replicas))
+    scale: Tensor = depth / (4 * n_terms)
+    return scale.clamp(0.0, 1.0)
 
 
 def _mixture(mode: Configurations, positive: Configurations, scale: Tensor) -> Configurations:

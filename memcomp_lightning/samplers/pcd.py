@@ -7,14 +7,14 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible, sweep
+from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of
 from memcomp_lightning.types import Configurations, NegativePhase
 
 
-class Chains(NamedTuple):
-    """Visible states of the persistent chains, ``(*replicas, n_chains, n_visible)``."""
+class ChainStates(NamedTuple):
+    """States of the persistent chains, ``(*replicas, n_chains, n_units)``: see :class:`gibbs.Chains`."""
 
-    v: Tensor
+    x: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,17 +45,17 @@ class PCD:
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
 
-    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> Chains:
+    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> ChainStates:
         """Start the chains at random states."""
         n = self.n_chains or n_chains * self.chains_per_datum
-        return Chains(random_visible(model, n, generator=generator))
+        return ChainStates(chains_of(model).random(n, generator=generator))
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: Chains, positive: Configurations, *, generator: Generator
-    ) -> NegativePhase[Chains]:
+        self, model: TwoLayerModel, state: ChainStates, positive: Configurations, *, generator: Generator
+    ) -> NegativePhase[ChainStates]:
         """Return one configuration a chain."""
-        v = state.v
+        chains, x = chains_of(model), state.x
         for _ in range(self.k):
-            v = sweep(model, v, generator=generator)
-        return NegativePhase(Configurations(v, model.hidden_mean(v)), Chains(v.clone()), {})
+            x = chains.sweep(x, generator=generator)
+        return NegativePhase(chains.read(x), ChainStates(x.clone()), {})

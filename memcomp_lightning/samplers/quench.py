@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible, sweep
+from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 
@@ -41,7 +41,8 @@ class Quench:
         self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration a start."""
-        v = random_visible(model, self.n_chains or positive.v.shape[-2], generator=generator)
-        v = sweep(model, v, beta=self.beta_hot, generator=generator)
-        v = sweep(model, v, generator=generator)
-        return NegativePhase(Configurations(v, model.hidden_mean(v)), state, {})
+        chains = chains_of(model)
+        x = chains.random(self.n_chains or positive.v.shape[-2], generator=generator)
+        x = chains.sweep(x, beta=self.beta_hot, generator=generator)
+        x = chains.sweep(x, generator=generator)
+        return NegativePhase(chains.read(x), state, {})

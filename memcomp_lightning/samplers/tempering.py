@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, random_visible
+from memcomp_lightning.samplers.gibbs import Chains, TwoLayerModel, chains_of
 from memcomp_lightning.types import Configurations, NegativePhase
 
 
@@ -24,7 +24,7 @@ class Ladder(NamedTuple):
     """Chains at all temperatures, from the coldest (beta = 1) to the hottest.
 
     Attributes:
-        v: Visible states, ``(*replicas, n_temperatures, n_chains, n_visible)``.
+        x: States, ``(*replicas, n_temperatures, n_chains, n_units)``: see :class:`gibbs.Chains`.
         gap: Difference of inverse temperature between neighbours, ``(*replicas, n_temperatures - 1)``.
         swap_rate: Running mean of the accepted share of exchanges, ``(*replicas, n_temperatures - 1)``.
         last_end: The end of the ladder that a state was at last: 1 the coldest, -1 the hottest, 0 none yet;
@@ -33,7 +33,7 @@ class Ladder(NamedTuple):
         n_rounds: Rounds of exchanges so far, a scalar.
     """
 
-    v: Tensor
+    x: Tensor
     gap: Tensor
     swap_rate: Tensor
     last_end: Tensor
@@ -82,14 +82,14 @@ class ParallelTempering:
     def init(self, model: TemperedModel, n_chains: int, *, generator: Generator) -> Ladder:
         """Start all chains at random states and the gaps equal."""
         n, n_temperatures, replicas = self.n_chains or n_chains, self.n_temperatures, model.replicas
-        v = random_visible(model, n_temperatures * n, generator=generator)
-        gap = torch.full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1)).to(v)
+        x = chains_of(model).random(n_temperatures * n, generator=generator)
+        gap = torch.full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1)).to(x)
         return Ladder(
-            v=v.unflatten(-2, (n_temperatures, n)),
+            x=x.unflatten(-2, (n_temperatures, n)),
             gap=gap,
             swap_rate=torch.full_like(gap, self.target_swap_rate),
-            last_end=torch.zeros((*replicas, n_temperatures, n), device=v.device),
-            round_trips=torch.zeros(replicas, device=v.device),
+            last_end=torch.zeros((*replicas, n_temperatures, n), device=x.device),
+            round_trips=torch.zeros(replicas, device=x.device),
             n_rounds=torch.zeros((), dtype=torch.long),
         )
 
@@ -98,38 +98,37 @@ class ParallelTempering:
         self, model: TemperedModel, state: Ladder, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[Ladder]:
         """Return the coldest configuration of each ladder."""
+        chains = chains_of(model)
         for _ in range(self.k):
-            state = self._round(model, state, generator)
-        v = state.v[..., 0, :, :].clone()
+            state = self._round(chains, state, generator)
         info = {
             "swap_rate": state.swap_rate.mean(-1),
             "swap_rate_lowest": state.swap_rate.amin(-1),
             "beta_hottest": betas(state.gap)[..., -1],
             "round_trips": state.round_trips.clone(),
         }
-        return NegativePhase(Configurations(v, model.hidden_mean(v)), state, info)
+        return NegativePhase(chains.read(state.x[..., 0, :, :].clone()), state, info)
 
-    def _round(self, model: TemperedModel, state: Ladder, generator: Generator) -> Ladder:
+    def _round(self, chains: Chains, state: Ladder, generator: Generator) -> Ladder:
         """A sweep at every temperature, and exchanges of every second pair of neighbours."""
-        shape, beta = state.v.shape, betas(state.gap)
+        shape, beta = state.x.shape, betas(state.gap)
         n_chains = shape[-2]
         every = beta.repeat_interleave(n_chains, dim=-1).unsqueeze(-1)
-        h = rng.bernoulli(model.hidden_mean(state.v.flatten(-3, -2), beta=every), generator=generator)
-        v = rng.bernoulli(model.visible_mean(h, beta=every), generator=generator)
-        energy = model.energy(v, h).unflatten(-1, (-1, n_chains))
+        x, energy = chains.swept_with_energy(state.x.flatten(-3, -2), beta=every, generator=generator)
+        energy = energy.unflatten(-1, (-1, n_chains))
         first = int(state.n_rounds) % 2
         cold, hot = slice(first, shape[-3] - 1, 2), slice(first + 1, None, 2)
         if energy[..., cold, :].shape[-2] == 0:  # two temperatures have no odd pair
-            return state._replace(v=v.view(shape), n_rounds=state.n_rounds + 1)
+            return state._replace(x=x.view(shape), n_rounds=state.n_rounds + 1)
         log_ratio = (beta[..., cold] - beta[..., hot]).unsqueeze(-1) * (energy[..., cold, :] - energy[..., hot, :])
         draw = rng.uniform(log_ratio.shape, generator=generator, like=log_ratio)
         swaps = draw < log_ratio.exp()
-        v, last_end = _exchanged(v.view(shape), swaps.unsqueeze(-1), cold, hot), state.last_end
+        x, last_end = _exchanged(x.view(shape), swaps.unsqueeze(-1), cold, hot), state.last_end
         last_end = _exchanged(last_end.unsqueeze(-1), swaps.unsqueeze(-1), cold, hot).squeeze(-1)
         home = last_end[..., 0, :] == -1
         last_end[..., 0, :], last_end[..., -1, :] = 1.0, _down(last_end[..., -1, :])
-        return self._adapted(state, swaps.to(v.dtype).mean(-1), cold)._replace(
-            v=v,
+        return self._adapted(state, swaps.to(x.dtype).mean(-1), cold)._replace(
+            x=x,
             last_end=last_end,
             round_trips=state.round_trips + home.sum(-1),
             n_rounds=state.n_rounds + 1,

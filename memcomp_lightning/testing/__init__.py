@@ -1,6 +1,14 @@
 """What other projects test their own parts with: conformance of samplers and solvers, statistical checks."""
 
-from memcomp_lightning.testing.conformance import check_sampler, check_solver
+from memcomp_lightning.testing.conformance import check_sampler, check_solver, small_dbm, small_machine, small_rbm
 from memcomp_lightning.testing.statistics import chi_square_p_value, state_counts
 
-__all__ = ["check_sampler", "check_solver", "chi_square_p_value", "state_counts"]
+__all__ = [
+    "check_sampler",
+    "check_solver",
+    "chi_square_p_value",
+    "small_dbm",
+    "small_machine",
+    "small_rbm",
+    "state_counts",
+]

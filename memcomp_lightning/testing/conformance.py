@@ -1,17 +1,21 @@
 """The conformance kit: what every sampler and every solver must do, whatever its method."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, Gaussian
+from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of
 from memcomp_lightning.types import Configurations
+
+ModelT = TypeVar("ModelT", RBM, DBM, BoltzmannMachine)
 
 
 def small_rbm(
@@ -20,18 +24,46 @@ def small_rbm(
     """A rectangular RBM with non-zero biases, so that a transpose or a sign shows."""
     generator = rng.stream(seed, "test model")
     rbm = RBM(n_visible, n_hidden, replicas=replicas, weight_init=Gaussian(std=std), generator=generator)
+    return _with_biases(rbm, generator)
+
+
+def small_dbm(*, replicas: tuple[int, ...] = ()) -> DBM:
+    """A DBM of 5, 3 and 2 units, biases drawn as those of :func:`small_rbm`."""
+    generator = rng.stream(0, "test model")
+    return _with_biases(
+        DBM(5, [3, 2], replicas=replicas, weight_init=Gaussian(std=0.8), generator=generator), generator
+    )
+
+
+def small_machine(*, replicas: tuple[int, ...] = ()) -> BoltzmannMachine:
+    """A Boltzmann machine of 4 visible and 3 hidden units, all but one pair coupled, with biases."""
+    generator = rng.stream(0, "test model")
+    pairs = full(7)[1:]
+    settings: dict[str, Any] = {"replicas": replicas, "weight_init": Gaussian(std=0.5), "generator": generator}
+    return _with_biases(BoltzmannMachine(4, 3, pairs, **settings), generator)
+
+
+def _with_biases(model: ModelT, generator: Generator) -> ModelT:
     with torch.no_grad():
-        rbm.b.normal_(0.3, 0.5, generator=generator)
-        rbm.c.normal_(-0.2, 0.5, generator=generator)
-    return rbm
+        model.b.normal_(0.3, 0.5, generator=generator)
+        model.c.normal_(-0.2, 0.5, generator=generator)
+    return model
 
 
-def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) -> None:
-    """Run a sampler on small RBMs with and without replica axes and check the contract.
+def check_sampler(
+    sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11, make: Callable[..., Any] = small_rbm
+) -> None:
+    """Run a sampler on small models with and without replica axes and check the contract.
 
     Checked: shapes, values in [0, 1], finite non-negative weights, a gradient for every parameter that does
     not flow into the sampler, model and state left alone, no draw from the global random stream, the same
     answer from the same stream, and that settings are frozen.
+
+    Args:
+        sampler: The sampler.
+        n_data: Images.
+        make: Takes ``replicas`` and returns the model: :func:`small_rbm`, or for samplers of any connectivity
+            :func:`small_dbm` and :func:`small_machine` as well.
 
     Raises:
         AssertionError: Naming what the sampler got wrong.
@@ -39,7 +71,7 @@ def check_sampler(sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11) 
     name = type(sampler).__name__
     _check_frozen(sampler)
     for replicas in ((), (3,), (2, 3)):
-        rbm = small_rbm(replicas=replicas)
+        rbm = make(replicas=replicas)
         before = [parameter.detach().clone() for parameter in rbm.parameters()]
         v_data = rng.uniform((*replicas, n_data, rbm.n_visible), generator=rng.stream(1, "data"))
         positive = positive_phase(rbm, v_data)
@@ -91,7 +123,7 @@ def _check_frozen(sampler: object) -> None:
 
 
 def _check_declarations(
-    sampler: NegativePhaseSampler[Any, Any], rbm: RBM, v_data: Tensor, answer: Configurations
+    sampler: NegativePhaseSampler[Any, Any], rbm: Any, v_data: Tensor, answer: Configurations
 ) -> None:
     """``uses_data`` and ``shared`` are there, and a sampler that denies using the data does not."""
     name = type(sampler).__name__
@@ -104,7 +136,7 @@ def _check_declarations(
         _check(other.v.equal(answer.v), f"{name} says uses_data = False, but other data give another answer")
 
 
-def _check_configurations(name: str, configurations: Configurations, rbm: RBM) -> None:
+def _check_configurations(name: str, configurations: Configurations, rbm: Any) -> None:
     v, h, weight = configurations
     _check(v.shape[:-2] == rbm.replicas, f"{name}: v has shape {tuple(v.shape)}, replicas are {rbm.replicas}")
     _check(v.shape[-1] == rbm.n_visible, f"{name}: last axis of v is {v.shape[-1]}, not {rbm.n_visible}")

@@ -110,17 +110,17 @@ def test_chains_of_the_inner_sampler_move_with_its_own_updates_alone():
     generator = rng.stream(0, "negative_phase")
     start = assisted(0.0).init(rbm, 1, generator=generator)
     by_mode = sample(assisted(1.0), rbm, start, generator)
-    assert by_mode.state.inner.v.equal(start.inner.v)
+    assert by_mode.state.inner.x.equal(start.inner.x)
     by_chains = sample(assisted(0.0), rbm, start, generator)
-    assert by_chains.state.inner.v.equal(by_chains.configurations.v)
+    assert by_chains.state.inner.x.equal(by_chains.configurations.v)
     assert by_mode.state.n_done == by_chains.state.n_done == 1
 
 
 def test_states_within_states_are_taken_apart_and_put_together():
     state = assisted(0.5).init(small_rbm(7, 5), 1, generator=rng.stream(0, "negative_phase"))
     tensors = tensors_of(state)
-    assert set(tensors) == {"n_done", "inner.v"}
+    assert set(tensors) == {"n_done", "inner.x"}
     again = with_tensors(state, {name: tensor + 1 for name, tensor in tensors.items()})
     assert type(again) is type(state)
-    assert again.inner.v.equal(state.inner.v + 1)
+    assert again.inner.x.equal(state.inner.x + 1)
     assert again.mode == state.mode

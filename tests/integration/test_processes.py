@@ -92,7 +92,7 @@ resumed, trainer = fit(4, "ckpt/to2.ckpt")
 if trainer.is_global_zero:
     same = all(a.equal(b) for a, b in zip(whole.parameters(), resumed.parameters()))
     states = torch.load("ckpt/to2.ckpt", weights_only=True)["process_states"]
-    chains = [state["extra"]["sampler"]["v"] for state in states]
+    chains = [state["extra"]["sampler"]["x"] for state in states]
     streams = [state["streams"]["negative_phase"] for state in states]
     print("resumed to the same bits:", same, "own chains:", not chains[0].equal(chains[1]),
           "own streams:", not streams[0].equal(streams[1]))

@@ -120,7 +120,7 @@ def test_persistent_chains_mix_by_their_state_alone():
     rbm = small_rbm(5, 3, std=2.5)
     sampler = PCD(k=1, n_chains=N_CHAINS)
     state = sampler.init(rbm, 1, generator=rng.stream(0, "negative_phase"))
-    state = state._replace(v=torch.ones_like(state.v))
+    state = state._replace(x=torch.ones_like(state.x))
     generator = rng.stream(0, "negative_phase")
     negative = sampler.sample(rbm, state, positive_phase(rbm, torch.zeros(2, 5)), generator=generator)
     negative = sampler.sample(rbm, negative.state, positive_phase(rbm, torch.zeros(2, 5)), generator=generator)

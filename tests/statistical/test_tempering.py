@@ -42,7 +42,7 @@ def p_values(rbm, of, adaptation=0.0):
     state = run(rbm, sampler, 1).state
     return [
         chi_square_p_value(state_counts(v), visible_probabilities(of, float(beta)))
-        for v, beta in zip(state.v, betas(state.gap), strict=True)
+        for v, beta in zip(state.x, betas(state.gap), strict=True)
     ]
 
 
@@ -73,7 +73,7 @@ def test_exchanges_cross_a_barrier_that_sweeps_do_not():
     ):
         generator = rng.stream(1, "negative_phase")
         state = sampler.init(rbm, 1, generator=generator)
-        state = state._replace(v=torch.ones_like(state.v))
+        state = state._replace(x=torch.ones_like(state.x))
         positive = positive_phase(rbm, torch.zeros(1, 5))
         for _ in range(6):
             negative = sampler.sample(rbm, state, positive, generator=generator)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, Qubo
 from memcomp_lightning.samplers import (
@@ -20,7 +21,7 @@ from memcomp_lightning.samplers import (
     Quench,
 )
 from memcomp_lightning.samplers.gibbs import sweep
-from memcomp_lightning.testing import check_sampler, check_solver
+from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
 from memcomp_lightning.types import Configurations, NegativePhase
 
 SOLVERS = {
@@ -73,6 +74,21 @@ def test_sampler_keeps_the_contract(sampler):
     check_sampler(sampler)
 
 
+OF_TWO_LAYERS = ("CD-1 of means",)
+
+
+@pytest.mark.parametrize("make", [small_dbm, small_machine])
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if name not in OF_TWO_LAYERS])
+def test_sampler_keeps_the_contract_for_any_connectivity(name, make):
+    check_sampler(SAMPLERS[name], make=make)
+
+
+@pytest.mark.parametrize("name", OF_TWO_LAYERS)
+def test_what_needs_two_layers_says_so(name):
+    with pytest.raises(SettingError, match=r"for a model other than an RBM"):
+        check_sampler(SAMPLERS[name], make=small_dbm)
+
+
 @pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 def test_solver_keeps_the_contract(solver):
     check_solver(solver)
@@ -95,8 +111,8 @@ class BrokenSampler(PCD):
 
 class ChangesItsState(BrokenSampler):
     def sample(self, model, state, positive, *, generator):
-        state.v.copy_(sweep(model, state.v, generator=generator))
-        return NegativePhase(Configurations(state.v, model.hidden_mean(state.v).detach()), state, {})
+        state.x.copy_(sweep(model, state.x, generator=generator))
+        return NegativePhase(Configurations(state.x, model.hidden_mean(state.x).detach()), state, {})
 
 
 class DrawsFromTheGlobalStream(BrokenSampler):
@@ -113,7 +129,7 @@ class DrawsFromTheGlobalStreamAtInit(BrokenSampler):
 
 class CarriesAGradient(BrokenSampler):
     def sample(self, model, state, positive, *, generator):
-        v = model.visible_mean(model.hidden_mean(state.v))
+        v = model.visible_mean(model.hidden_mean(state.x))
         return NegativePhase(Configurations(v, model.hidden_mean(v).detach()), state, {})
 
 

@@ -1,0 +1,157 @@
+"""Likelihoods of machines of any connectivity: what is special to them, on top of those of RBMs."""
+
+import copy
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.likelihood.layers import softplus
+from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine
+from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.models.mean_field import hidden_blocks, mean_field
+from memcomp_lightning.models.rbm import RBM
+
+_NUMBERS = 2**23
+"""float64 numbers held at a time."""
+
+
+@torch.no_grad()
+def folded(model: BoltzmannMachine) -> RBM:
+    """The RBM between the two classes of a machine that has two, the units of the first as its visible ones.
+
+    Its partition function is that of the machine; of a DBM, it has the odd layers on one side and the even ones on
+    the other (Salakhutdinov & Hinton 2009).
+
+    Raises:
+        SettingError: The machine has more classes, or one.
+    """
+    blocks = model.blocks()
+    require(
+        len(blocks) == 2,
+        "number of classes of units",
+        len(blocks),
+        "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
+        "Other machines can be enumerated up to 32 units outside the largest class.",
+    )
+    first, second = blocks
+    rbm = RBM(len(first.units), len(second.units), replicas=model.replicas)
+    rbm.to(model.b)
+    weight = torch.zeros_like(rbm.weight)
+    weight[..., torch.searchsorted(first.units, second.neighbours)] = second.weight
+    rbm.weight.copy_(weight)
+    rbm.b.copy_(first.bias)
+    rbm.c.copy_(second.bias)
+    return rbm
+
+
+def base_on_first_class(model: BoltzmannMachine, base: Tensor) -> Tensor:
+    """A base of visible units as one of the units of the first class, zero for the hidden ones among them."""
+    units = model.classes[0]
+    wide = base.new_zeros(*base.shape[:-1], model.n_units)
+    wide[..., : model.n_visible] = base
+    return wide[..., units]
+
+
+@torch.no_grad()
+def log_partition_function_by_classes(model: BoltzmannMachine, max_units: int) -> Float[Tensor, "*replicas"]:
+    """Log Z by enumerating all units outside the largest class."""
+    model = _double(model)
+    blocks = model.blocks()
+    largest = max(blocks, key=lambda block: len(block.units))
+    others = _without(torch.arange(model.n_units, device=model.b.device), largest.units)
+    _require_few(len(others), max_units)
+    rows = max(1, _NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
+    parts = []
+    for start in range(0, 2 ** len(others), rows):
+        states = binary_states(
+            len(others), start=start, stop=min(start + rows, 2 ** len(others)), like=model.b.detach()
+        )
+        x = states.new_zeros(*model.replicas, len(states), model.n_units)
+        x[..., others] = states
+        parts.append(_summed_over(model, largest, x).logsumexp(-1))
+    return torch.stack(parts).logsumexp(0)
+
+
+@torch.no_grad()
+def log_hidden_sum(model: BoltzmannMachine, v: Tensor, max_units: int) -> Float[Tensor, "*replicas n"]:
+    """Log of the sum over h of exp(-E(v, h)), by enumerating all hidden units outside their largest class."""
+    model = _double(model)
+    v = v.double().expand(*model.replicas, *v.shape[-2:])
+    if model.n_hidden == 0:
+        return -model.energy(v, v[..., :0])
+    largest = max(hidden_blocks(model), key=lambda block: len(block.units))
+    hidden = torch.arange(model.n_visible, model.n_units, device=v.device)
+    others = _without(hidden, largest.units)
+    _require_few(len(others), max_units)
+    states = binary_states(len(others), like=v)
+    rows = max(1, _NUMBERS // (len(states) * model.n_units * max(1, math.prod(model.replicas))))
+    parts = []
+    for some in v.split(rows, dim=-2):
+        x = some.new_zeros(*some.shape[:-1], len(states), model.n_units)
+        x[..., : model.n_visible] = some.unsqueeze(-2)
+        x[..., others] = states
+        log_sums = _summed_over(model, largest, x.flatten(-3, -2)).unflatten(-1, x.shape[-3:-1])
+        parts.append(log_sums.logsumexp(-1))
+    return torch.cat(parts, dim=-1)
+
+
+@torch.no_grad()
+def log_likelihood_bound(
+    model: BoltzmannMachine,
+    v: Float[Tensor, "*axes n n_visible"],
+    log_z: Float[Tensor, "*replicas"],
+    *,
+    max_iterations: int = 100,
+    tolerance: float = 1e-4,
+) -> Float[Tensor, "*replicas n"]:
+    r"""Return the mean-field lower bound of log p(v).
+
+    .. math:: \log p(v) \ge -E(v, \mu) + \sum_i H(\mu_i) - \log Z
+
+    with the means :math:`\mu` of :func:`memcomp_lightning.models.mean_field` and their entropies H
+    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled.
+
+    Args:
+        model: The machine.
+        v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
+        log_z: Log of the partition function, ``(*replicas,)``. One from AIS is too low on average, and the bound
+            then too high.
+        max_iterations: Of the mean field, >= 1.
+        tolerance: Of the mean field, > 0.
+    """
+    require_count("max_iterations", max_iterations)
+    model = _double(model)
+    v = v.double().expand(*model.replicas, *v.shape[-2:])
+    found = []
+    for some in v.split(10_000, dim=-2):
+        h = mean_field(model, some, max_iterations=max_iterations, tolerance=tolerance).h
+        entropy = -(torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
+        found.append(entropy - model.energy(some, h))
+    return torch.cat(found, dim=-1) - log_z.double().unsqueeze(-1)
+
+
+def _summed_over(model: BoltzmannMachine, block: Block, x: Tensor) -> Tensor:
+    """Log of the sum of exp(-E) over the units of a block, which are 0 in x."""
+    energy = model.energy(x[..., : model.n_visible], x[..., model.n_visible :])
+    return softplus(block.field(x)).sum(-1) - energy
+
+
+def _double(model: BoltzmannMachine) -> BoltzmannMachine:
+    return model if model.b.dtype == torch.float64 else copy.deepcopy(model).double()
+
+
+def _without(units: Tensor, some: Tensor) -> Tensor:
+    return units[~torch.isin(units, some)]
+
+
+def _require_few(n_units: int, max_units: int) -> None:
+    require(
+        n_units <= max_units,
+        "units outside the largest class",
+        n_units,
+        f"at most max_units = {max_units}, because all their states are enumerated",
+        "Use Ais for machines of two classes, or a smaller one.",
+    )

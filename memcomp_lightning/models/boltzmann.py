@@ -1,0 +1,274 @@
+"""The Boltzmann machine: visible and hidden units with any symmetric connectivity."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.linalg import vecdot
+
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
+from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.mean_field import mean_field
+from memcomp_lightning.objective import shares
+from memcomp_lightning.rng import stream
+from memcomp_lightning.types import Configurations
+
+
+class Block(NamedTuple):
+    """Units without couplings among them, with all that they are coupled to, at the present parameters.
+
+    Attributes:
+        units: Their indices, ``(n_class,)``.
+        neighbours: Indices of the units coupled to any of them, ``(n_neighbours,)``.
+        weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
+        bias: ``(*replicas, n_class)``.
+    """
+
+    units: Tensor
+    neighbours: Tensor
+    weight: Tensor
+    bias: Tensor
+
+    def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
+        """Log odds of each unit given all others."""
+        return affine(x[..., self.neighbours], self.weight, self.bias)
+
+
+class _Layout(NamedTuple):
+    """Where the couplings of a block go: number ``edge`` of the list into ``slot`` of its flat matrix.
+
+    The first ``n_forward`` have their other end in a later block: all blocks together have each pair once there.
+    """
+
+    units: Tensor
+    neighbours: Tensor
+    edge: Tensor
+    slot: Tensor
+    n_forward: int
+
+
+_INDICES = ("units", "neighbours", "edge", "slot")
+
+
+class BoltzmannMachine(nn.Module):
+    r"""Units x = (v, h) in {0, 1} with couplings between any pairs.
+
+    .. math:: E(x) = -\sum_{(i, j)} w_{ij} x_i x_j - \sum_i a_i x_i, \qquad a = (b, c)
+
+    (Ackley, Hinton & Sejnowski 1985.) Units are coloured so that no two of a class are coupled; a class is drawn,
+    or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent units.
+
+    Attributes:
+        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first.
+        coupling: w, one number a pair, ``(*replicas, n_pairs)``.
+        b: Visible bias, ``(*replicas, n_visible)``.
+        c: Hidden bias, ``(*replicas, n_hidden)``.
+        classes: Indices of the units of each colour; those with more visible units come first.
+
+    Args:
+        n_visible: Number of visible units, >= 1.
+        n_hidden: Number of hidden units, >= 0.
+        connectivity: Pairs of units, or a symmetric mask ``(n_units, n_units)``; None couples all. See
+            :mod:`memcomp_lightning.models.connectivity` for grids, layers and graphs of annealers.
+        replicas: Leading axes of independent machines that share every call.
+        weight_init: Draws a matrix ``(*replicas, n_units, n_units)``, whose upper triangle gives the couplings;
+            the biases start at zero.
+        generator: Random stream of the couplings; None is a fresh stream of seed 0.
+
+    Raises:
+        SettingError: A mask that is not symmetric or couples a unit to itself; a pair that is given twice or whose
+            units do not exist; a visible unit without any coupling.
+
+    >>> machine = BoltzmannMachine(n_visible=3, n_hidden=2)
+    >>> machine.energy(torch.zeros(5, 3), torch.zeros(5, 2)).shape
+    torch.Size([5])
+    """
+
+    def __init__(
+        self,
+        n_visible: int,
+        n_hidden: int,
+        connectivity: Tensor | Iterable[tuple[int, int]] | None = None,
+        *,
+        replicas: tuple[int, ...] = (),
+        weight_init: Initialiser | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        super().__init__()
+        require_count("n_visible", n_visible)
+        require_count("n_hidden", n_hidden, minimum=0)
+        n_units = n_visible + n_hidden
+        pairs = _pairs_of(n_units, connectivity)
+        alone = torch.bincount(pairs.flatten(), minlength=n_units)[:n_visible] == 0
+        require(
+            not bool(alone.any()) or n_units == 1,
+            "visible unit",
+            alone.nonzero()[:5].flatten().tolist(),
+            "at least one coupling for each visible unit",
+            "A unit without couplings learns its mean alone: couple it, or leave it out of the data.",
+        )
+        generator = stream(0, "weights") if generator is None else generator
+        self.pairs: Tensor
+        self.register_buffer("pairs", pairs, persistent=False)
+        draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
+        self.coupling = nn.Parameter(draw)
+        self.b = nn.Parameter(torch.zeros(*replicas, n_visible))
+        self.c = nn.Parameter(torch.zeros(*replicas, n_hidden))
+        classes = sorted(colouring(n_units, pairs), key=lambda units: -int((units < n_visible).sum()))
+        self._n_forward: list[int] = []
+        for number, layout in enumerate(_layouts(n_units, pairs, classes)):
+            self._n_forward.append(layout.n_forward)
+            for name in _INDICES:
+                self.register_buffer(f"_{name}{number}", getattr(layout, name), persistent=False)
+
+    def _initial(
+        self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
+    ) -> Tensor:
+        """Initial couplings."""
+        matrix = weight_init((*replicas, n_units, n_units), generator=generator)
+        return matrix[..., self.pairs[:, 0], self.pairs[:, 1]]
+
+    @property
+    def n_visible(self) -> int:
+        """Number of visible units."""
+        return self.b.shape[-1]
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of hidden units."""
+        return self.c.shape[-1]
+
+    @property
+    def n_units(self) -> int:
+        """Number of all units."""
+        return self.n_visible + self.n_hidden
+
+    @property
+    def replicas(self) -> tuple[int, ...]:
+        """Leading axes of independent machines."""
+        return tuple(self.coupling.shape[:-1])
+
+    @property
+    def bias(self) -> Tensor:
+        """A = (b, c), ``(*replicas, n_units)``."""
+        return torch.cat((self.b, self.c), dim=-1)
+
+    @property
+    def classes(self) -> list[Tensor]:
+        """Indices of the units of each colour."""
+        return [layout.units for layout in self._layouts()]
+
+    def _layouts(self) -> list[_Layout]:
+        return [
+            _Layout(**{name: getattr(self, f"_{name}{number}") for name in _INDICES}, n_forward=n_forward)
+            for number, n_forward in enumerate(self._n_forward)
+        ]
+
+    def blocks(self) -> list[Block]:
+        """The classes, each with its couplings: what a sweep over all units needs."""
+        bias, found = self.bias, []
+        for units, neighbours, edge, slot, _ in self._layouts():
+            flat = self.coupling.new_zeros(*self.replicas, len(units) * len(neighbours))
+            weight = flat.index_copy(-1, slot, self.coupling[..., edge])
+            found.append(
+                Block(units, neighbours, weight.unflatten(-1, (len(units), len(neighbours))), bias[..., units])
+            )
+        return found
+
+    def energy(
+        self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
+    ) -> Float[Tensor, "*replicas n"]:
+        """E(v, h) of each configuration."""
+        x = torch.cat((v, h), dim=-1)
+        coupled = sum(
+            ((block.field(x) - block.bias.unsqueeze(-2)) * x[..., block.units]).sum(-1) for block in self.blocks()
+        )
+        return -0.5 * coupled - (x * self.bias.unsqueeze(-2)).sum(-1)
+
+    def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
+        """Mean of E over configurations, by their weights."""
+        return self.total_energy(configurations.v, configurations.h, shares(configurations))
+
+    def total_energy(
+        self,
+        v: Float[Tensor, "*replicas n n_visible"],
+        h: Float[Tensor, "*replicas n n_hidden"],
+        weight: Float[Tensor, "*replicas n"],
+    ) -> Float[Tensor, "*replicas"]:
+        """Weighted sum of E over configurations, constants to autograd; the weights may have any sign."""
+        with torch.no_grad():
+            x = torch.cat((v, h), dim=-1)
+            moment, mean = self._moments(x, x * weight.unsqueeze(-1))
+        total: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
+        return total
+
+    def centred_total_energy(
+        self,
+        v: Float[Tensor, "*replicas n n_visible"],
+        h: Float[Tensor, "*replicas n n_hidden"],
+        weight: Float[Tensor, "*replicas n"],
+        visible_offset: Float[Tensor, "*replicas n_visible"],
+        hidden_offset: Float[Tensor, "*replicas n_hidden"],
+    ) -> Float[Tensor, "*replicas"]:
+        """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
+
+        (Montavon & Mueller 2012.)
+        """
+        with torch.no_grad():
+            value = self.total_energy(v, h, weight)
+            offset = torch.cat((visible_offset, hidden_offset), dim=-1)
+            x = torch.cat((v, h), dim=-1) - offset.unsqueeze(-2)
+            moment, mean = self._moments(x, x * weight.unsqueeze(-1))
+            first, second = self.pairs[:, 0], self.pairs[:, 1]
+            mean = mean.index_add(-1, first, moment * offset[..., second], alpha=-1)
+            mean = mean.index_add(-1, second, moment * offset[..., first], alpha=-1)
+        surrogate: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
+        return value + (surrogate - surrogate.detach())
+
+    def _moments(self, x: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
+        """Sums over configurations of the product of each pair and of each unit."""
+        moment = torch.empty_like(self.coupling)
+        for units, neighbours, edge, slot, n in self._layouts():
+            if n:
+                products = (x[..., units].mT @ weighted[..., neighbours]).flatten(-2)
+                moment.index_copy_(-1, edge[:n], products[..., slot[:n]])
+        return moment, weighted.sum(-2)
+
+    def hidden_mean(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
+        """E[h | v]: exact if no two hidden units are coupled, otherwise by :func:`mean_field`, its defaults."""
+        return mean_field(self, v).h
+
+
+def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | None) -> Pairs:
+    if connectivity is None:
+        return full(n_units)
+    if isinstance(connectivity, Tensor) and connectivity.shape == (n_units, n_units) != (2, 2):
+        return from_mask(connectivity)
+    if isinstance(connectivity, Tensor) and (connectivity.ndim != 2 or connectivity.shape[1] != 2):
+        require(False, "shape of connectivity", tuple(connectivity.shape), f"{(n_units, n_units)} or (n_pairs, 2)")
+    return from_pairs(n_units, connectivity)
+
+
+def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Layout]:
+    colour, place = torch.empty(n_units, dtype=torch.long), torch.empty(n_units, dtype=torch.long)
+    for number, units in enumerate(classes):
+        colour[units], place[units] = number, torch.arange(len(units))
+    found = []
+    for number, units in enumerate(classes):
+        ends, edges = [], []
+        for here, there in ((0, 1), (1, 0)):
+            edge = (colour[pairs[:, here]] == number).nonzero().flatten()
+            ends.append(torch.stack((pairs[edge, here], pairs[edge, there]), dim=-1))
+            edges.append(edge)
+        end, edge = torch.cat(ends), torch.cat(edges)
+        forward = colour[end[:, 1]] > number
+        order = forward.to(torch.int8).argsort(descending=True, stable=True)
+        end, edge = end[order], edge[order]
+        neighbours, column = end[:, 1].unique(return_inverse=True)
+        slot = place[end[:, 0]] * len(neighbours) + column
+        found.append(_Layout(units, neighbours, edge, slot, int(forward.sum())))
+    return found

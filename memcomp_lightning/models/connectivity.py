@@ -1,0 +1,153 @@
+"""Which units of a Boltzmann machine are coupled, and groups of units that are not."""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from memcomp_lightning.errors import require, require_count
+
+Pairs = Int[Tensor, "n_pairs 2"]
+"""Coupled units, each pair once, the lower index first, in ascending order."""
+
+
+def full(n_units: int) -> Pairs:
+    """Every pair.
+
+    >>> full(3).tolist()
+    [[0, 1], [0, 2], [1, 2]]
+    """
+    require_count("n_units", n_units)
+    return torch.combinations(torch.arange(n_units)) if n_units > 1 else torch.empty(0, 2, dtype=torch.long)
+
+
+def layered(sizes: Sequence[int]) -> Pairs:
+    """Every unit of a layer with every unit of the next: an RBM for two sizes, a DBM for more.
+
+    >>> layered([1, 2, 1]).tolist()
+    [[0, 1], [0, 2], [1, 3], [2, 3]]
+    """
+    for size in sizes:
+        require_count("size of a layer", size)
+    bounds = torch.tensor([0, *sizes]).cumsum(0).tolist()
+    layers = [torch.arange(start, stop) for start, stop in pairwise(bounds)]
+    return torch.cat(
+        [torch.cartesian_prod(lower, upper) for lower, upper in pairwise(layers)]
+        or [torch.empty(0, 2, dtype=torch.long)]
+    )
+
+
+def grid(n_rows: int, n_columns: int) -> Pairs:
+    """Neighbours in a rectangle, units row by row.
+
+    >>> grid(2, 2).tolist()
+    [[0, 1], [0, 2], [1, 3], [2, 3]]
+    """
+    require_count("n_rows", n_rows)
+    require_count("n_columns", n_columns)
+    at = torch.arange(n_rows * n_columns).view(n_rows, n_columns)
+    right = torch.stack((at[:, :-1], at[:, 1:]), dim=-1).view(-1, 2)
+    down = torch.stack((at[:-1], at[1:]), dim=-1).view(-1, 2)
+    return from_pairs(at.numel(), torch.cat((right, down)))
+
+
+def from_graph(graph: Any) -> Pairs:
+    """Edges of a networkx graph, nodes numbered in ascending order: ``dwave_networkx.zephyr_graph(2)``, say.
+
+    Args:
+        graph: Anything with ``nodes`` and ``edges``; the nodes can be sorted.
+    """
+    number = {node: index for index, node in enumerate(sorted(graph.nodes))}
+    edges = [(number[first], number[second]) for first, second in graph.edges]
+    return from_pairs(len(number), torch.tensor(edges, dtype=torch.long).view(-1, 2))
+
+
+def from_mask(mask: Tensor) -> Pairs:
+    """The pairs of a symmetric matrix.
+
+    Args:
+        mask: ``(n, n)``: True, or other than zero, where two units are coupled.
+
+    Raises:
+        SettingError: It is not square, not symmetric, or couples a unit to itself.
+    """
+    require(mask.ndim == 2 and mask.shape[0] == mask.shape[1], "shape of the mask", tuple(mask.shape), "(n, n)")
+    mask = mask != 0
+    require(
+        bool(mask.equal(mask.mT)),
+        "mask",
+        f"asymmetric at {(mask ^ mask.mT).nonzero()[:1].tolist()}",
+        "a symmetric matrix: a coupling has no direction",
+        "Use mask | mask.T.",
+    )
+    itself = mask.diagonal().nonzero()[:1].flatten().tolist()
+    require(not itself, "mask", f"unit {itself} coupled to itself", "a diagonal of zeros; what is there is a bias")
+    return mask.triu().nonzero()
+
+
+def from_pairs(n_units: int, pairs: Int[Tensor, "n_pairs 2"] | Iterable[tuple[int, int]]) -> Pairs:
+    """Bring a list of pairs into order.
+
+    Raises:
+        SettingError: A unit that does not exist, a pair given twice (in either order), a unit with itself.
+    """
+    require_count("n_units", n_units)
+    given = torch.as_tensor(pairs if isinstance(pairs, Tensor) else list(pairs), dtype=torch.long)
+    require(given.numel() == 0 or (given.ndim == 2 and given.shape[1] == 2), "pairs", tuple(given.shape), "(n, 2)")
+    given = given.view(-1, 2)
+    outside = given[(given < 0) | (given >= n_units)][:1].tolist()
+    require(not outside, "unit of a pair", outside, f"0 to n_units - 1 = {n_units - 1}")
+    itself = given[given[:, 0] == given[:, 1]][:1].tolist()
+    require(not itself, "pair", itself, "two different units; a unit with itself is a bias")
+    ordered, _ = given.sort(dim=-1)
+    key, count = (ordered[:, 0] * n_units + ordered[:, 1]).unique(return_counts=True)
+    twice = key[count > 1][:1]
+    require(not len(twice), "pair", [(int(k) // n_units, int(k) % n_units) for k in twice], "each pair once")
+    return torch.stack((key // n_units, key % n_units), dim=-1)
+
+
+def colouring(n_units: int, pairs: Pairs) -> list[Int[Tensor, " n_class"]]:
+    """Split the units into classes without couplings inside, so that a class can be drawn at once.
+
+    Two classes where two suffice (an RBM, a DBM, a grid); otherwise the better of two greedy colourings, outwards
+    from the first unit and by degree. At most one class more than a unit has couplings.
+
+    >>> [units.tolist() for units in colouring(4, grid(2, 2))]
+    [[0, 3], [1, 2]]
+    """
+    neighbours: list[list[int]] = [[] for _ in range(n_units)]
+    for first, second in pairs.tolist():
+        neighbours[first].append(second)
+        neighbours[second].append(first)
+    by_degree = sorted(range(n_units), key=lambda unit: -len(neighbours[unit]))
+    found = min((_greedy(neighbours, order) for order in (_outwards(neighbours), by_degree)), key=max)
+    colours = torch.tensor(found)
+    return [(colours == colour).nonzero().flatten() for colour in range(max(found) + 1)]
+
+
+def _greedy(neighbours: list[list[int]], order: Sequence[int]) -> list[int]:
+    colour = [-1] * len(neighbours)
+    for unit in order:
+        taken = {colour[other] for other in neighbours[unit]}
+        colour[unit] = next(number for number in range(len(neighbours)) if number not in taken)
+    return colour
+
+
+def _outwards(neighbours: list[list[int]]) -> list[int]:
+    """Breadth first from each part's first unit: greedy colouring in this order needs two colours if two do."""
+    order, seen = [], [False] * len(neighbours)
+    for start in range(len(neighbours)):
+        waiting = deque([] if seen[start] else [start])
+        seen[start] = True
+        while waiting:
+            unit = waiting.popleft()
+            order.append(unit)
+            for other in neighbours[unit]:
+                if not seen[other]:
+                    seen[other] = True
+                    waiting.append(other)
+    return order

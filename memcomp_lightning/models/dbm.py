@@ -1,0 +1,114 @@
+"""The deep Boltzmann machine: layers of hidden units, all in one energy."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
+from memcomp_lightning.models.connectivity import layered
+from memcomp_lightning.models.dbn import DBN
+from memcomp_lightning.models.init import Gaussian, Initialiser
+
+
+class DBM(BoltzmannMachine):
+    r"""Each layer is coupled to the next; a Boltzmann machine whose mask says so.
+
+    .. math:: E(v, h_1, h_2, \ldots) = -h_1^T W_1 v - h_2^T W_2 h_1 - \ldots - b^T v - \sum_l c_l^T h_l
+
+    (Salakhutdinov & Hinton 2009.) The odd and the even layers are the two classes of units.
+
+    Args:
+        n_visible: Number of visible units.
+        hidden_sizes: Units of each hidden layer, at least one layer.
+        replicas: Leading axes of independent machines.
+        weight_init: Draws the weights of each layer, as in :class:`DBN`: the same stream gives the same weights.
+        generator: Random stream of the weights; None is a fresh stream of seed 0.
+
+    >>> [tuple(weight.shape) for weight in DBM(5, [3, 2]).weights()]
+    [(3, 5), (2, 3)]
+    """
+
+    def __init__(
+        self,
+        n_visible: int,
+        hidden_sizes: Sequence[int],
+        *,
+        replicas: tuple[int, ...] = (),
+        weight_init: Initialiser | None = None,
+        generator: Generator | None = None,
+    ) -> None:
+        require_count("number of hidden layers", len(hidden_sizes))
+        self.sizes = (n_visible, *hidden_sizes)
+        super().__init__(
+            n_visible,
+            sum(hidden_sizes),
+            layered(self.sizes),
+            replicas=replicas,
+            weight_init=weight_init,
+            generator=generator,
+        )
+
+    def _initial(
+        self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
+    ) -> Tensor:
+        """Initial couplings, layer by layer."""
+        init = weight_init or Gaussian(std=0.01)
+        drawn = [init((*replicas, n_out, n_in), generator=generator) for n_in, n_out in pairwise(self.sizes)]
+        return _flat(drawn)
+
+    def weights(self) -> list[Float[Tensor, "*replicas n_out n_in"]]:
+        """The couplings of each layer to the one below, as copies."""
+        parts = self.coupling.split([n_in * n_out for n_in, n_out in pairwise(self.sizes)], dim=-1)
+        return [
+            part.unflatten(-1, (n_in, n_out)).mT
+            for part, (n_in, n_out) in zip(parts, pairwise(self.sizes), strict=True)
+        ]
+
+    def hidden_layers(self, h: Float[Tensor, "*axes n_hidden"]) -> tuple[Float[Tensor, "*axes n_layer"], ...]:
+        """The part of each layer of something that all hidden units have."""
+        return tuple(h.split(self.sizes[1:], dim=-1))
+
+    @torch.no_grad()
+    def take(self, dbn: DBN) -> None:
+        """Take weights and biases of a DBN of the same sizes.
+
+        The bias of a hidden layer is that of its RBM and, where the RBM above has visible biases of its own for
+        these units, theirs added: a bias that both learned is in both.
+
+        Raises:
+            SettingError: The DBN has other sizes.
+        """
+        self._check(dbn)
+        self.coupling.copy_(_flat([rbm.weight for rbm in dbn]))
+        self.b.copy_(dbn[0].b)
+        above = [*(rbm.b for rbm in list(dbn)[1:]), torch.zeros_like(dbn[-1].c)]
+        self.c.copy_(torch.cat([rbm.c + b for rbm, b in zip(dbn, above, strict=True)], dim=-1))
+
+    @torch.no_grad()
+    def give(self, dbn: DBN) -> None:
+        """Set a DBN of the same sizes to these weights and biases; visible biases above the first layer to zero.
+
+        ``take`` undoes it.
+
+        Raises:
+            SettingError: The DBN has other sizes.
+        """
+        self._check(dbn)
+        for rbm, weight, c in zip(dbn, self.weights(), self.hidden_layers(self.c), strict=True):
+            rbm.weight.copy_(weight)
+            rbm.b.zero_()
+            rbm.c.copy_(c)
+        dbn[0].b.copy_(self.b)
+
+    def _check(self, dbn: DBN) -> None:
+        sizes = (dbn.n_visible, *(rbm.n_hidden for rbm in dbn))
+        require(sizes == self.sizes, "sizes of the DBN", sizes, f"{self.sizes}, those of the DBM")
+
+
+def _flat(weights: Sequence[Tensor]) -> Tensor:
+    """Couplings in the order of :func:`layered`."""
+    return torch.cat([weight.mT.flatten(-2) for weight in weights], dim=-1)
