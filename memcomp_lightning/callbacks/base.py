@@ -13,7 +13,8 @@ dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
 Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
 epoch), ``iterations`` (passes of a stage or layer, default the trainer's ``max_epochs``), ``progress`` (text of
 the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``dbn`` and ``layer`` (the stack that
-``rbm`` is part of), ``sampler`` (tells whether chains persist, default yes), ``active_optimizer``.
+``rbm`` is part of), ``models`` (all that are trained, if ``rbm`` is one of several), ``sampler`` (tells whether
+chains persist, default yes), ``active_optimizer``.
 """
 
 from abc import ABC, abstractmethod
@@ -27,6 +28,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.enumeration import n_enumerated
 from memcomp_lightning.plotting.rendering import rendered
 
 
@@ -96,18 +98,17 @@ def write_figure(trainer: pl.Trainer, module: pl.LightningModule, tag: str, figu
 
 
 def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_units: int) -> None:
-    """Refuse models whose smaller layer is too large to enumerate: all of the module's stack, before training.
+    """Refuse models that are too large to enumerate (:func:`n_enumerated`): all of the module's, before training.
 
     Raises:
         SettingError: Naming callback and size.
     """
-    dbn = getattr(module, "dbn", None)
-    for rbm in [rbm_of(module)] if dbn is None else dbn:
-        n_units = min(rbm.n_visible, rbm.n_hidden)
+    for rbm in getattr(module, "models", None) or [rbm_of(module)]:
+        n_units = n_enumerated(rbm)
         name = type(callback).__name__
         require(
             n_units <= max_units,
-            f"size of the smaller layer for {name}",
+            f"units to enumerate for {name}",
             n_units,
             f"at most {max_units} units, because all their states are enumerated",
             f"Leave {name} out, or train a model with a smaller layer.",

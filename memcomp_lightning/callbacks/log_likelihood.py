@@ -17,6 +17,10 @@ from memcomp_lightning.callbacks.base import (
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.samplers.gibbs import has_classes
+
+MOST_HIDDEN = 16
+"""Hidden units of a Boltzmann machine beyond which the mean-field bound stands for the likelihood."""
 
 
 class LogLikelihood(EveryIterations):
@@ -26,7 +30,8 @@ class LogLikelihood(EveryIterations):
     a validation at the end of the pass, if there is one. Images that are not 0 or 1 have no likelihood under a
     Bernoulli model: each intensity is taken as the probability of a 1 and drawn, with a random stream of the
     callback's own, the same draws each time. In upper layers of a stack the "images" are mean activations, drawn
-    likewise, and the likelihood is that of the layer.
+    likewise, and the likelihood is that of the layer. Of a Boltzmann machine with more than 16 hidden units it is
+    the mean-field bound.
 
     By annealed importance sampling (Salakhutdinov & Murray 2008), from independent units with the means of the
     training images, log Z is an estimate that tends to be too small, the likelihood too large;
@@ -142,5 +147,7 @@ class LogLikelihood(EveryIterations):
     def _total(rbm: Any, v: Tensor, bits: Generator) -> Tensor:
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
         log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
-        total: Tensor = likelihood.log_likelihood(rbm, rng.bernoulli(v, generator=bits), log_z).double().sum(-1)
-        return total
+        v = rng.bernoulli(v, generator=bits)
+        bounded = has_classes(rbm) and rbm.n_hidden > MOST_HIDDEN
+        log_p = (likelihood.log_likelihood_bound if bounded else likelihood.log_likelihood)(rbm, v, log_z)
+        return log_p.double().sum(-1)

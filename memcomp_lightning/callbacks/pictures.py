@@ -11,7 +11,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, required, tensorboards
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
-from memcomp_lightning.samplers.gibbs import random_visible, sweep
+from memcomp_lightning.samplers.gibbs import chains_of
 
 
 class Layout(Protocol):
@@ -103,10 +103,11 @@ class ModelSamples(Pictures):
         """Run the chains and project them down to the inputs."""
         rbm = rbm_of(pl_module)
         generator = rng.stream(self.seed, "evaluation")
-        v = random_visible(rbm, self.n_pictures, generator=generator)
+        chains = chains_of(rbm)
+        x = chains.random(self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
-            v = sweep(rbm, v, generator=generator)
-        return _images(pl_module, rbm.visible_mean(rbm.hidden_mean(v)))
+            x = chains.sweep(x, generator=generator)
+        return _images(pl_module, rbm.visible_mean(chains.read(x).h))
 
 
 class ChainPictures(Pictures):

@@ -107,11 +107,12 @@ def _chains_persist(module: pl.LightningModule) -> bool:
     if init is None:
         return True
     rbm = rbm_of(module)
-    return _holds_chains(init(rbm, 1, generator=rng.stream(0, "check")), rbm.n_visible)
+    widths = (rbm.n_visible, rbm.n_visible + rbm.n_hidden)
+    return _holds_chains(init(rbm, 1, generator=rng.stream(0, "check")), widths)
 
 
-def _holds_chains(state: Any, n_visible: int) -> bool:
-    """Whether a sampler's state, or one in it, holds visible states."""
+def _holds_chains(state: Any, widths: tuple[int, ...]) -> bool:
+    """Whether a sampler's state, or one in it, holds states of the visible units or of all."""
     if isinstance(state, Tensor):
-        return state.ndim >= 2 and state.shape[-1] == n_visible
-    return isinstance(state, tuple) and any(_holds_chains(part, n_visible) for part in state)
+        return state.ndim >= 2 and state.shape[-1] in widths
+    return isinstance(state, tuple) and any(_holds_chains(part, widths) for part in state)

@@ -21,7 +21,7 @@ from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.models import DBN, Randomiser
-from memcomp_lightning.modules import Classifier, DBNClassifier, DBNPretraining, OptimizerFactory, StageModule
+from memcomp_lightning.modules import Classifier, DBNClassifier, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
@@ -63,7 +63,7 @@ _GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "traine
 _SETTINGS = {
     "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
-    "pretrain": (*_STAGE_SETTINGS, "centring"),
+    "pretrain": (*_STAGE_SETTINGS, "centring", "module"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),
     "callbacks": ("pretrain", "finetune"),
 }
@@ -93,18 +93,19 @@ def build(config: DictConfig) -> Plan:
         centring = instantiate(config.pretrain.centring)
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
-        pretraining = Stage(
-            DBNPretraining(
+        make = instantiate(config.pretrain.module)
+        try:
+            module = make(
                 network,
                 _sampler(config, data),
                 iterations=config.pretrain.iterations,
                 optimizer=_optimizer(config, "pretrain", callbacks),
                 centring=centring,
                 seed=seed,
-            ),
-            data,
-            callbacks,
-        )
+            )
+        except TypeError as error:
+            raise UserError(f"pretrain.module: {error}") from error
+        pretraining = Stage(module, data, callbacks)
     if config.finetune.iterations > 0:
         callbacks = _callbacks(config, "finetune")
         require(

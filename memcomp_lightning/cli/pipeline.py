@@ -19,7 +19,15 @@ from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import Classifier, DBNPretraining, evaluate, load_weights, save_weights
+from memcomp_lightning.modules import (
+    Classifier,
+    DBMPretraining,
+    DBNPretraining,
+    EnergyPretraining,
+    evaluate,
+    load_weights,
+    save_weights,
+)
 from memcomp_lightning.modules.weights import AtomicCheckpointIO, check_fits, read_checkpoint
 
 log = logging.getLogger(__name__)
@@ -154,7 +162,7 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
 def _trained(stage: Stage) -> torch.nn.Module:
     """What a stage trains: the DBN, or the network with its output layer."""
     module = stage.module
-    if isinstance(module, DBNPretraining):
+    if isinstance(module, DBNPretraining | DBMPretraining):
         return module.dbn
     return cast(Classifier, module).network
 
@@ -162,8 +170,9 @@ def _trained(stage: Stage) -> torch.nn.Module:
 def _record(stage: Stage) -> dict[str, Any]:
     module = stage.module
     record: dict[str, Any] = {"iterations": module.iterations, "wall_time_s": module.wall_time_s}
-    if isinstance(module, DBNPretraining):
+    if isinstance(module, EnergyPretraining):
         record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
+        record["trained"] = module.model_names
     return record
 
 

@@ -42,8 +42,8 @@ def run_table(result: dict[str, Any]) -> str:
     rows = [["stage", "iterations", "energy gap (data - model)", "test accuracy", "wall time"]]
     for name, record in result["stages"].items():
         gaps = record.get("energy_gap", [])
-        for layer, gap in enumerate(gaps, start=1):
-            rows.append([f"{name} layer {layer}", str(record["iterations"]), with_error(gap), "", ""])
+        for trained, gap in zip(record.get("trained", []), gaps, strict=False):
+            rows.append([f"{name} {trained}", str(record["iterations"]), with_error(gap), "", ""])
         if not gaps:
             rows.append([name, str(record["iterations"]), "", with_error(result["test_accuracy"]), ""])
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"

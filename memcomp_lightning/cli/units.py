@@ -15,8 +15,8 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LearningRateDecay, MomentumSchedule
 from memcomp_lightning.cli.build import Plan, Stage, build, given
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import Classifier, DBNPretraining, DivergedError, evaluate
-from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
+from memcomp_lightning.modules import Classifier, DBMPretraining, DBNPretraining, DivergedError, evaluate
+from memcomp_lightning.replicas import Rates, finetune, pretrain, pretrain_jointly, stacked
 from memcomp_lightning.report import Record
 from memcomp_lightning.types import Batch
 
@@ -174,17 +174,18 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
     network = plan.network.to(device)
     if plan.pretraining is not None:
         stage = plan.pretraining
-        module = stage.module
-        assert isinstance(module, DBNPretraining)
-        pretrain(
-            module.dbn,
-            stage.data.train_batches(0, 1).to(device),
-            module.sampler,
-            iterations=module.iterations,
-            rates=rates_of(stage),
-            centring=module.centring,
-            seed=seed,
-        )
+        module, batches = stage.module, stage.data.train_batches(0, 1).to(device)
+        assert isinstance(module, DBNPretraining | DBMPretraining)
+        settings: dict[str, Any] = {
+            "iterations": module.iterations,
+            "rates": rates_of(stage),
+            "centring": module.centring,
+            "seed": seed,
+        }
+        if isinstance(module, DBMPretraining):
+            pretrain_jointly(module.dbn, batches, module.sampler, module.positive, **settings)
+        else:
+            pretrain(module.dbn, batches, module.sampler, **settings)
     if plan.between is not None and isinstance(network, DBN):
         plan.between(network, generator=rng.stream(seed, "between stages"))
     return plan

@@ -179,6 +179,16 @@ class BoltzmannMachine(nn.Module):
             )
         return found
 
+    @property
+    def weight(self) -> Float[Tensor, "*replicas n_hidden n_visible"]:
+        """Couplings of hidden to visible units, zero where there are none, as a copy."""
+        n, (first, second) = self.n_visible, self.pairs.unbind(-1)
+        across = (first < n) & (second >= n)
+        flat = self.coupling.new_zeros(*self.replicas, self.n_hidden * n)
+        at = (second[across] - n) * n + first[across]
+        weight: Tensor = flat.index_copy(-1, at, self.coupling[..., across]).unflatten(-1, (self.n_hidden, n))
+        return weight
+
     def energy(
         self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
     ) -> Float[Tensor, "*replicas n"]:
@@ -241,6 +251,19 @@ class BoltzmannMachine(nn.Module):
     def hidden_mean(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
         """E[h | v]: exact if no two hidden units are coupled, otherwise by :func:`mean_field`, its defaults."""
         return mean_field(self, v).h
+
+    def visible_mean(self, h: Float[Tensor, "*replicas n n_hidden"]) -> Float[Tensor, "*replicas n n_visible"]:
+        """E[v | h]: exact if no two visible units are coupled, otherwise by the mean field."""
+        return mean_field(self, h, clamped="hidden").h
+
+    def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
+        r"""The mean-field free energy, ``E(v, m) - \sum_i H(m_i)`` with the means m of the hidden units.
+
+        It is F(v) if no two hidden units are coupled, and above it otherwise.
+        """
+        h = self.hidden_mean(v)
+        negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
+        return self.energy(v, h) + negative_entropy
 
 
 def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | None) -> Pairs:

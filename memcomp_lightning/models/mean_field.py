@@ -1,7 +1,7 @@
-"""Mean-field inference of hidden units that are coupled to each other."""
+"""Mean-field inference of units that are coupled to each other, with others clamped."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -26,10 +26,10 @@ class ClassedModel(Protocol):
 
 
 class MeanFieldSolution(NamedTuple):
-    """Means of the hidden units given the visible ones.
+    """Means of the free units, usually the hidden ones.
 
     Attributes:
-        h: ``(*replicas, n, n_hidden)`` in (0, 1).
+        h: ``(*replicas, n, n_free)`` in (0, 1).
         change: Largest change of a mean in the last iteration, ``(*replicas,)``.
         converged: Whether it is below the tolerance, ``(*replicas,)``.
         n_iterations: Iterations done.
@@ -43,45 +43,67 @@ class MeanFieldSolution(NamedTuple):
 
 @torch.no_grad()
 def mean_field(
-    model: ClassedModel, v: Tensor, *, max_iterations: int = 30, tolerance: float = 1e-3
+    model: ClassedModel,
+    given: Tensor,
+    *,
+    clamped: Literal["visible", "hidden"] = "visible",
+    max_iterations: int = 30,
+    tolerance: float = 1e-3,
 ) -> MeanFieldSolution:
-    r"""Iterate ``h_i = sigmoid(field_i(v, h))``, class by class, from 1/2.
+    r"""Iterate ``m_i = sigmoid(field_i)`` over the free units, class by class, from 1/2.
 
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
-    p(h | v) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration is exact
-    if no two hidden units are coupled. It stops when no mean changes by more than the tolerance, or says that it
-    did not converge.
+    p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration
+    is exact if no two free units are coupled. It stops when no mean changes by more than the tolerance, or says
+    that it did not converge.
 
     Args:
         model: The machine.
-        v: Visible units in [0, 1], ``(*replicas, n, n_visible)``.
+        given: The clamped units in [0, 1], ``(*replicas, n, n_visible)`` or ``(*replicas, n, n_hidden)``.
+        clamped: Which units are given.
         max_iterations: >= 1.
         tolerance: > 0.
     """
     n_visible = model.n_visible
-    x = torch.cat((v, v.new_full((*v.shape[:-1], model.n_hidden), 0.5)), dim=-1)
-    blocks = hidden_blocks(model)
-    coupled = any(bool((block.neighbours >= n_visible).any()) for block in blocks)
-    change = v.new_zeros(v.shape[:-2])
+    free = slice(n_visible, None) if clamped == "visible" else slice(0, n_visible)
+    n_free = model.n_hidden if clamped == "visible" else n_visible
+    unknown = given.new_full((*given.shape[:-1], n_free), 0.5)
+    x = torch.cat((given, unknown) if clamped == "visible" else (unknown, given), dim=-1)
+    blocks = hidden_blocks(model) if clamped == "visible" else visible_blocks(model)
+    coupled = any(bool(_among(block.neighbours, n_visible, clamped).any()) for block in blocks)
+    change = given.new_zeros(given.shape[:-2])
     n_iterations = 0
     for n_iterations in range(1, (max_iterations if coupled else 1) + 1):  # noqa: B007
         change = torch.zeros_like(change)
         for block in blocks:
             mean = torch.sigmoid(block.field(x))
-            change = torch.maximum(change, (mean - x[..., block.units]).abs().amax((-2, -1)))
+            if coupled:
+                change = torch.maximum(change, (mean - x[..., block.units]).abs().amax((-2, -1)))
             x[..., block.units] = mean
-        if not coupled:
-            change = torch.zeros_like(change)
         if bool((change < tolerance).all()):
             break
-    return MeanFieldSolution(x[..., n_visible:], change, change < tolerance, n_iterations)
+    return MeanFieldSolution(x[..., free], change, change < tolerance, n_iterations)
 
 
 def hidden_blocks(model: ClassedModel) -> list[Any]:
     """The hidden units of each class, without the classes that have none."""
+    return _part(model, "visible")
+
+
+def visible_blocks(model: ClassedModel) -> list[Any]:
+    """The visible units of each class, without the classes that have none."""
+    return _part(model, "hidden")
+
+
+def _among(units: Tensor, n_visible: int, clamped: str) -> Tensor:
+    """Which units are free."""
+    return units >= n_visible if clamped == "visible" else units < n_visible
+
+
+def _part(model: ClassedModel, clamped: str) -> list[Any]:
     found = []
     for block in model.blocks():
-        keep = (block.units >= model.n_visible).nonzero().flatten()
+        keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
         if len(keep):
             weight, bias = block.weight.index_select(-2, keep), block.bias.index_select(-1, keep)
             found.append(block._replace(units=block.units[keep], weight=weight, bias=bias))

@@ -2,7 +2,9 @@
 
 from memcomp_lightning.modules.baseline import BaselineClassifier
 from memcomp_lightning.modules.classifier import Classifier, Score, evaluate, score
+from memcomp_lightning.modules.energy import EnergyPretraining
 from memcomp_lightning.modules.finetuning import DBNClassifier
+from memcomp_lightning.modules.joint import BoltzmannPretraining, DBMPretraining, joined
 from memcomp_lightning.modules.losses import LOSSES, Loss, cross_entropy, squared_error
 from memcomp_lightning.modules.pretraining import DBNPretraining
 from memcomp_lightning.modules.stage import DivergedError, OptimizerFactory, StageModule
@@ -11,17 +13,21 @@ from memcomp_lightning.modules.weights import CheckpointError, load_weights, sav
 __all__ = [
     "LOSSES",
     "BaselineClassifier",
+    "BoltzmannPretraining",
     "CheckpointError",
     "Classifier",
+    "DBMPretraining",
     "DBNClassifier",
     "DBNPretraining",
     "DivergedError",
+    "EnergyPretraining",
     "Loss",
     "OptimizerFactory",
     "Score",
     "StageModule",
     "cross_entropy",
     "evaluate",
+    "joined",
     "load_weights",
     "save_weights",
     "score",

@@ -1,16 +1,16 @@
 """The loops of pretraining and fine-tuning on the replica axis.
 
-They do what ``DBNPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and, on the CPU,
-draw for draw: a replica here ends with the weights of the run that trains it alone. On another device chains are
-drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out looks at
-training, which costs more than an update of a small network.
+They do what ``DBNPretraining``, ``DBMPretraining`` and ``Classifier`` do under a Lightning trainer, update for
+update and, on the CPU, draw for draw: a replica here ends with the weights of the run that trains it alone. On
+another device chains are drawn there, from a stream of that device, and nothing waits for it within a pass. What
+they leave out looks at training, which costs more than an update of a small network.
 """
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import torch
-from torch import Generator, nn
+from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 
 from memcomp_lightning import rng
@@ -18,11 +18,11 @@ from memcomp_lightning.callbacks.learning_rate_decay import set_learning_rate
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy
+from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy, joined
 from memcomp_lightning.modules.stage import diverged_parameter
 from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.replicas.backprop import gradient_of
-from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
+from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhaseSampler, positive_phase
 from memcomp_lightning.types import Configurations, NegativePhase
 
 
@@ -114,29 +114,90 @@ def pretrain_layer(
     """
     require_count("iterations", iterations, minimum=0)
     rbm = dbn[layer]
-    optimizer, state = rates.optimizer(rbm.parameters()), None
+    yield from _follow_contrast(
+        rbm,
+        lambda v: positive_phase(rbm, dbn.visible_of(layer, v)),
+        batches,
+        sampler,
+        passes=range(layer * iterations, (layer + 1) * iterations),
+        rates=rates,
+        centring=centring,
+        generator=generator,
+    )
+    _check_finite(rbm, f"pretraining, layer {layer + 1}")
+
+
+def pretrain_jointly(
+    dbn: DBN,
+    batches: Batches,
+    sampler: NegativePhaseSampler[Any, Any],
+    positive: PositivePhaseSampler,
+    *,
+    iterations: int,
+    rates: Rates,
+    centring: Centring | None = None,
+    seed: int = 0,
+) -> None:
+    """Train all layers of a DBN at once, in place, as ``DBMPretraining`` does.
+
+    Arguments are those of :func:`pretrain`, with what supplies the hidden units given the data.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations, minimum=0)
+    dbm = joined(dbn)
+    device = dbm.b.device
+    of_data = rng.stream(seed, "positive_phase", device=device)
+    for _ in _follow_contrast(
+        dbm,
+        lambda v: positive.sample(dbm, v, generator=of_data).configurations,
+        batches,
+        sampler,
+        passes=range(iterations),
+        rates=rates,
+        centring=centring,
+        generator=rng.stream(seed, "negative_phase", device=device),
+    ):
+        pass
+    _check_finite(dbm, "joint pretraining")
+    dbm.give(dbn)
+
+
+def _follow_contrast(
+    model: Any,
+    positive_of: Callable[[Tensor], Configurations],
+    batches: Batches,
+    sampler: NegativePhaseSampler[Any, Any],
+    *,
+    passes: range,
+    rates: Rates,
+    centring: Centring | None,
+    generator: Generator,
+) -> Iterator[Pass]:
+    """Train one model in place, in passes of these numbers; yield each once it is done."""
+    optimizer, state = rates.optimizer(model.parameters()), None
     offsets: Offsets | None = None
-    for iteration in range(iterations):
-        rates.begin_pass(optimizer, iteration)
-        batches.set_epoch(layer * iterations + iteration)
+    for done, epoch in enumerate(passes):
+        rates.begin_pass(optimizer, done)
+        batches.set_epoch(epoch)
         negative: NegativePhase[Any] | None = None
         for batch in batches:
             with torch.no_grad():
-                positive = positive_phase(rbm, dbn.visible_of(layer, batch.v))
+                positive = positive_of(batch.v)
             if state is None:
-                state = sampler.init(rbm, positive.v.shape[-2], generator=generator)
+                state = sampler.init(model, positive.v.shape[-2], generator=generator)
             if negative is None and centring is not None:
                 offsets = centring.follow(offsets, positive)
             if negative is None or sampler.uses_data:
-                negative = sampler.sample(rbm, state, positive, generator=generator)
+                negative = sampler.sample(model, state, positive, generator=generator)
                 state = negative.state
-            (batch.share * contrast(rbm, positive, negative.configurations, offsets).sum()).backward()
+            (batch.share * contrast(model, positive, negative.configurations, offsets).sum()).backward()
             if batch.closes_step:
                 optimizer.step()
                 optimizer.zero_grad()
                 negative = None
-        yield Pass(iteration + 1, state, positive)
-    _check_finite(rbm, f"pretraining, layer {layer + 1}")
+        yield Pass(done + 1, state, positive)
 
 
 def finetune(

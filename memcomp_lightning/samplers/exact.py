@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import softplus
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.models.enumeration import binary_states, n_enumerated
 from memcomp_lightning.samplers.gibbs import TwoLayerModel, has_classes
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
@@ -56,7 +56,7 @@ class Exact:
         Raises:
             SettingError: The smaller layer has more than ``max_units`` units.
         """
-        n_units = _n_enumerated(model)
+        n_units = n_enumerated(model)
         require(
             n_units <= self.max_units,
             "units outside the largest class" if has_classes(model) else "size of the smaller layer",
@@ -84,12 +84,6 @@ class Exact:
         else:
             configurations = Configurations(states, model.hidden_mean(states), weight)
         return NegativePhase(configurations, state, {})
-
-
-def _n_enumerated(model: Any) -> int:
-    if has_classes(model):
-        return int(model.n_visible + model.n_hidden - max(len(block.units) for block in model.blocks()))
-    return int(min(model.n_visible, model.n_hidden))
 
 
 def _all_of_classes(model: Any) -> Configurations:

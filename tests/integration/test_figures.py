@@ -76,6 +76,22 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
 
 
+@pytest.mark.parametrize("sampler", ["cd", "pcd", "dmm_qubo"])
+def test_a_replica_trained_jointly_is_the_single_run(memcomp_train: Run, sampler: str) -> None:
+    joint = ["pretrain=joint", f"sampler={sampler}", "pretrain.module.positive.max_iterations=5"]
+    curve = f"+figure.curves.joint={{label: joint, overrides: {[*joint]}}}"
+    figure = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[3]", "figure.seeds=[5]", curve]
+    outcome = memcomp_train(*figure, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    settings = [o for o in SMALL if not o.startswith("figure")]
+    lengths = ["pretrain.iterations=3", "finetune.iterations=2", "seed=5"]
+    single = memcomp_train(*settings, *joint, *lengths, "hydra.run.dir=single")
+    assert single.status == 0, single.err
+    result = json.loads(Path("single/result.json").read_text())
+    record = only(records(), "joint", 3)
+    assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+
+
 def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run, joblib_launcher: list[str]) -> None:
     """As a user would ask Hydra for Fig. 4: samplers, pretraining lengths and seeds, by the joblib launcher."""
     single = ["data=digits", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=3"]

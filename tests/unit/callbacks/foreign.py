@@ -91,7 +91,7 @@ class TheirChains(TheirRBM):
         return {"v": batch[0].expand(2, -1, -1)}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["theirs"] = {"generator": self.their_generator.get_state(), "v": self.chains.v}
+        checkpoint["theirs"] = {"generator": self.their_generator.get_state(), "v": self.chains.x}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.their_generator.set_state(checkpoint["theirs"]["generator"])

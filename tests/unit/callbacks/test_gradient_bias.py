@@ -90,6 +90,6 @@ def test_layers_too_large_to_enumerate_are_refused_before_training(tmp_path: Pat
     module = TheirRBM()
     module.rbm = RBM(17, 18, weight_init=Gaussian(std=0.3))
     with pytest.raises(
-        SettingError, match=r"smaller layer for GradientBias = 17 .* at most 16 .*Leave GradientBias"
+        SettingError, match=r"units to enumerate for GradientBias = 17 .* at most 16 .*Leave GradientBias"
     ):
         fit(tmp_path, [GradientBias()], module=module)

@@ -64,7 +64,7 @@ def test_training_is_the_same_bit_for_bit(tmp_path: Path, method: str) -> None:
 
 @fits
 def test_a_model_too_large_to_enumerate_is_refused_before_training(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"smaller layer for LogLikelihood = 5 .* at most 4 units"):
+    with pytest.raises(SettingError, match=r"units to enumerate for LogLikelihood = 5 .* at most 4 units"):
         fit(tmp_path, [LogLikelihood(method="exact", max_units=4)])
 
 

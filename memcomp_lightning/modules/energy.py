@@ -1,0 +1,164 @@
+"""What the pretraining of any energy model shares: both phases, the contrast, the sampler's state."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from lightning.fabric.utilities import move_data_to_device
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
+from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
+from memcomp_lightning.types import Batch, Configurations, NegativePhase
+
+
+class EnergyPretraining(StageModule):
+    """Follow the gradient of the contrast of both phases, for one energy model after the other.
+
+    Args:
+        sampler: Supplies the negative phase.
+        iterations: Passes over the training set for each model, >= 1.
+        optimizer: Builds the optimiser of one model from its parameters.
+        centring: Settings of the centred gradient; None follows the plain one.
+        seed: Seed of the random streams.
+
+    Attributes:
+        energy_gaps: For each model begun, mean energy of the data less that of the negative phase, in its newest
+            update, ``(*replicas,)``: the contrast.
+    """
+
+    stage = "pretrain"
+
+    def __init__(
+        self,
+        sampler: NegativePhaseSampler[Any, Any],
+        *,
+        iterations: int,
+        optimizer: OptimizerFactory,
+        centring: Centring | None,
+        seed: int,
+    ) -> None:
+        require_count("pretrain.iterations", iterations)
+        super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
+        self.sampler = sampler
+        self.centring = centring
+        self.energy_gaps: list[Tensor] = []
+        self._sampler_state: Any = None
+        self._offsets: Offsets | None = None
+        self._negative: NegativePhase[Any] | None = None
+        self._gap: Tensor | float = 0.0
+
+    @property
+    @abstractmethod
+    def models(self) -> Sequence[Any]:
+        """All energy models that are trained, in order."""
+
+    @property
+    def model_names(self) -> list[str]:
+        """What each of them is called in tables."""
+        return ["jointly"]
+
+    @abstractmethod
+    def positive_phase(self, batch: Batch) -> PositivePhase:
+        """The data of a batch and the hidden units given them, in the model in training."""
+
+    @property
+    def n_epochs(self) -> int:
+        """Value for the trainer's ``max_epochs``: all models."""
+        return self.iterations * len(self.models)
+
+    @property
+    def layer(self) -> int:
+        """Index of the model in training, 0 being the first."""
+        return min(self.current_epoch // self.iterations, len(self.models) - 1)
+
+    @property
+    def iteration(self) -> int:
+        """Passes done over the training set for this model."""
+        return self.current_epoch - self.layer * self.iterations
+
+    @property
+    def rbm(self) -> Any:
+        """The model in training."""
+        return self.models[self.layer]
+
+    def on_train_epoch_start(self) -> None:
+        """A new model starts without chains."""
+        if self.iteration == 0:
+            self._sampler_state, self._offsets = None, None
+            self.energy_gaps = [*self.energy_gaps, torch.zeros(self.rbm.replicas)]
+
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Follow the gradient of the contrast of both phases.
+
+        Returns:
+            ``loss`` (scalar), ``contrast`` ``(*replicas,)``, ``positive`` and ``negative``
+            (:class:`Configurations`) and the samplers' ``info``: what the callbacks look at.
+        """
+        rbm = self.rbm
+        with torch.no_grad():
+            positive, inferred = self.positive_phase(batch)
+        if self._negative is None and self.centring is not None:
+            offsets = self.centring.follow(self._offsets, positive)
+            self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))
+        if self._negative is None or self.sampler.uses_data:
+            self._negative = self._negative_phase(rbm, positive)
+        negative = self._negative
+        gap = contrast(rbm, positive, negative.configurations, self._offsets)
+        loss = batch.share * gap.sum()
+        self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
+        self._gap = self._gap + batch.share * gap.detach()
+        if batch.closes_step:
+            self.energy_gaps[self.layer] = self._mean_over_processes(self._gap)
+            self._negative, self._gap = None, 0.0
+        return {
+            "loss": loss.detach(),
+            "contrast": gap.detach(),
+            "positive": positive,
+            "negative": negative.configurations,
+            "info": {**inferred, **negative.info},
+        }
+
+    def _negative_phase(self, rbm: Any, positive: Configurations) -> NegativePhase[Any]:
+        """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
+        generator = self.streams["negative_phase"]
+        if self._sampler_state is None:
+            self._sampler_state = self.sampler.init(rbm, positive.v.shape[-2], generator=generator)
+        negative: NegativePhase[Any] | None = None
+        one_for_all = self.sampler.shared and self.trainer.world_size > 1
+        if self.trainer.is_global_zero or not one_for_all:
+            negative = self.sampler.sample(rbm, self._sampler_state, positive, generator=generator)
+        if one_for_all:
+            negative = self.trainer.strategy.broadcast(move_data_to_device(negative, "cpu"))
+            negative = move_data_to_device(negative, self.device)
+        if negative is None:
+            raise RuntimeError("the process of rank 0 sent no negative phase")
+        self._sampler_state = negative.state
+        return negative
+
+    def _mean_over_processes(self, value: Tensor | float) -> Tensor:
+        value = torch.as_tensor(value)
+        if self.trainer.world_size == 1:
+            return value
+        return cast(Tensor, self.trainer.strategy.reduce(value, reduce_op="mean"))
+
+    def extra_state(self) -> dict[str, Any]:
+        """The sampler's chains, the offsets and the energy gaps."""
+        chains = None if self._sampler_state is None else tensors_of(self._sampler_state)
+        offsets = None if self._offsets is None else self._offsets._asdict()
+        state = {"sampler": chains, "offsets": offsets, "energy_gaps": list(self.energy_gaps)}
+        return cast(dict[str, Any], move_data_to_device(state, "cpu"))
+
+    def take_extra_state(self, state: dict[str, Any]) -> None:
+        """Take back the sampler's chains, the offsets and the energy gaps."""
+        self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
+        if state.get("offsets") is not None:
+            self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
+        if state["sampler"] is not None:
+            template = self.sampler.init(self.rbm, 1, generator=rng.stream(self.seed, "check"))
+            chains = {name: tensor.to(self.device) for name, tensor in state["sampler"].items()}
+            self._sampler_state = with_tensors(template, chains)

@@ -1,0 +1,118 @@
+"""Pretraining of all layers at once, as one deep Boltzmann machine."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from memcomp_lightning import rng
+from memcomp_lightning.models import DBM, DBN, BoltzmannMachine
+from memcomp_lightning.modules.energy import EnergyPretraining
+from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.samplers import MeanField, NegativePhaseSampler, PositivePhase, PositivePhaseSampler
+from memcomp_lightning.types import Batch
+
+
+class BoltzmannPretraining(EnergyPretraining):
+    """Train a Boltzmann machine of any connectivity.
+
+    One epoch is one *iteration*, a pass over the training set.
+
+    Args:
+        model: The machine; trained in place.
+        sampler: Supplies the negative phase.
+        positive: Supplies the hidden units given the data; what it reports is logged with the sampler's report.
+        iterations: Passes over the training set, >= 1.
+        optimizer: Builds the optimiser from the parameters.
+        centring: Settings of the centred gradient; None follows the plain one.
+        seed: Seed of the random streams.
+
+    Raises:
+        SettingError: ``iterations`` out of range, or a machine that the sampler cannot handle.
+    """
+
+    stream_names = ("negative_phase", "positive_phase")
+
+    def __init__(
+        self,
+        model: BoltzmannMachine,
+        sampler: NegativePhaseSampler[Any, Any],
+        *,
+        positive: PositivePhaseSampler | None = None,
+        iterations: int = 50,
+        optimizer: OptimizerFactory = PAPER_SGD,
+        centring: Centring | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(sampler, iterations=iterations, optimizer=optimizer, centring=centring, seed=seed)
+        sampler.init(model, 1, generator=rng.stream(seed, "check"))
+        self.model = model
+        self.positive = MeanField() if positive is None else positive
+
+    @property
+    def models(self) -> Sequence[BoltzmannMachine]:
+        """The machine."""
+        return [self.model]
+
+    def configure_optimizers(self) -> Optimizer:
+        """One optimiser for all parameters of the machine."""
+        return self.make_optimizer(self.model.parameters())
+
+    def positive_phase(self, batch: Batch) -> PositivePhase:
+        """The images, and the hidden units given them."""
+        return self.positive.sample(self.model, batch.v, generator=self.streams["positive_phase"])
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Return held-out images ``v``, for the callbacks."""
+        return {"v": batch.v}
+
+
+class DBMPretraining(BoltzmannPretraining):
+    """Train all layers of a DBN at once, as the DBM that has its weights.
+
+    After every pass the DBN has the weights of the DBM, ready to be fine-tuned as after greedy pretraining.
+
+    Args:
+        dbn: The network; its weights are where training starts, random ones or those of greedy pretraining.
+        sampler: Supplies the negative phase.
+        positive: Supplies the hidden units given the data; None is the mean field.
+        iterations: Passes over the training set, >= 1, for all layers together.
+        optimizer: Builds the optimiser from the parameters.
+        centring: Settings of the centred gradient; None follows the plain one.
+        seed: Seed of the random streams.
+
+    Raises:
+        SettingError: ``iterations`` out of range, or a DBM that the sampler cannot handle.
+    """
+
+    def __init__(self, dbn: DBN, sampler: NegativePhaseSampler[Any, Any], **settings: Any) -> None:
+        super().__init__(joined(dbn), sampler, **settings)
+        self.dbn = dbn
+
+    @property
+    def log_prefix(self) -> str:
+        """Prefix of tags."""
+        return f"{self.stage}/joint"
+
+    def on_train_epoch_end(self) -> None:
+        """Hand the weights to the DBN."""
+        assert isinstance(self.model, DBM)
+        self.model.give(self.dbn)
+
+    def parameters_at_rest(self) -> Iterable[Parameter]:
+        """Those of the DBN, which only receives."""
+        return self.dbn.parameters()
+
+
+def joined(dbn: DBN) -> DBM:
+    """The DBM with the weights of a DBN, on its device."""
+    sizes = [rbm.n_hidden for rbm in dbn]
+    dbm = DBM(dbn.n_visible, sizes, replicas=dbn.replicas)
+    dbm.to(dbn[0].b)
+    with torch.no_grad():
+        dbm.take(dbn)
+    return dbm
