@@ -3,8 +3,8 @@
 A module that trains an energy model offers both of these:
 
 * ``training_step`` returns a dictionary with ``positive`` and ``negative`` (:class:`Configurations`),
-  ``contrast`` ``(*replicas,)`` and ``info`` (diagnostics of the sampler); ``validation_step`` returns one
-  with ``v``, the visible states of held-out images.
+  ``contrast`` ``(*replicas,)`` and ``info`` (diagnostics of the sampler), and with ``v``, the visible states of
+  the images, if ``positive.v`` is something else; ``validation_step`` returns one with ``v`` of held-out images.
 * Attributes: ``rbm``, the model in training.
 
 A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.modules.Score`) in the
@@ -177,6 +177,15 @@ class EveryIterations(pl.Callback, ABC):
     @abstractmethod
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """What a subclass does with the model and the outputs of the pass's last ``training_step``."""
+
+
+def images_of_step(outputs: Mapping[str, Any], callback: pl.Callback) -> Tensor:
+    """Visible states of the images of a step: ``v``, or those of ``positive``."""
+    if isinstance(outputs, Mapping) and "v" in outputs:
+        v: Tensor = outputs["v"]
+        return v
+    images: Tensor = required(outputs, "positive", callback).v
+    return images
 
 
 def required(outputs: Mapping[str, Any], key: str, callback: pl.Callback) -> Any:

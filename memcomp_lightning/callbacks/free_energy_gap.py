@@ -6,7 +6,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from memcomp_lightning.callbacks.base import LastImages, log_scalars, rbm_of, required
+from memcomp_lightning.callbacks.base import LastImages, images_of_step, log_scalars, rbm_of, required
 
 
 class FreeEnergyGap(pl.Callback):
@@ -35,7 +35,7 @@ class FreeEnergyGap(pl.Callback):
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Keep the visible states of the last batches, as many as asked for."""
-        self._train.add(required(outputs, "positive", self).v)
+        self._train.add(images_of_step(outputs, self))
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start a new mean."""

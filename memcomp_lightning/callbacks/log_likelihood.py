@@ -11,6 +11,7 @@ from memcomp_lightning import likelihood, rng
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
     LastImages,
+    images_of_step,
     log_scalars,
     rbm_of,
     require_enumerable,
@@ -92,7 +93,7 @@ class LogLikelihood(EveryIterations):
         """Keep the visible states of the last batches."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
         if self.is_due(trainer, pl_module):
-            self._train.add(required(outputs, "positive", self).v)
+            self._train.add(images_of_step(outputs, self))
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start a new sum, and the draws of the same bits as before."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, rbm_of, required
+from memcomp_lightning.callbacks.base import EveryIterations, images_of_step, log_scalars, rbm_of
 
 
 class ReconstructionError(EveryIterations):
@@ -19,7 +19,7 @@ class ReconstructionError(EveryIterations):
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Reconstruct the last batch of the pass."""
-        v = required(outputs, "positive", self).v
+        v = images_of_step(outputs, self)
         rbm = rbm_of(pl_module)
         error = (v - rbm.visible_mean(rbm.hidden_mean(v))).square().mean((-1, -2))
         log_scalars(pl_module, {"reconstruction_error": error})

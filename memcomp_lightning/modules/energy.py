@@ -63,8 +63,12 @@ class EnergyPretraining(StageModule):
         return ["jointly"]
 
     @abstractmethod
-    def positive_phase(self, batch: Batch) -> PositivePhase:
-        """The data of a batch and the hidden units given them, in the model in training."""
+    def visible_of(self, batch: Batch) -> Tensor:
+        """What the model in training sees of a batch, ``(*replicas, n, n_visible)``."""
+
+    @abstractmethod
+    def infer(self, v: Tensor) -> PositivePhase:
+        """Visible states and the hidden units given them, in the model in training."""
 
     @property
     def n_epochs(self) -> int:
@@ -96,12 +100,14 @@ class EnergyPretraining(StageModule):
         """Follow the gradient of the contrast of both phases.
 
         Returns:
-            ``loss`` (scalar), ``contrast`` ``(*replicas,)``, ``positive`` and ``negative``
-            (:class:`Configurations`) and the samplers' ``info``: what the callbacks look at.
+            ``loss`` (scalar), ``contrast`` ``(*replicas,)``, ``v`` (the model's visible states of the images),
+            ``positive`` and ``negative`` (:class:`Configurations`) and the samplers' ``info``: what the callbacks
+            look at.
         """
         rbm = self.rbm
         with torch.no_grad():
-            positive, inferred = self.positive_phase(batch)
+            v = self.visible_of(batch)
+            positive, inferred = self.infer(v)
         if self._negative is None and self.centring is not None:
             offsets = self.centring.follow(self._offsets, positive)
             self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))
@@ -118,10 +124,15 @@ class EnergyPretraining(StageModule):
         return {
             "loss": loss.detach(),
             "contrast": gap.detach(),
+            "v": v,
             "positive": positive,
             "negative": negative.configurations,
             "info": {**inferred, **negative.info},
         }
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Return the model's visible states ``v`` of held-out images, for the callbacks."""
+        return {"v": self.visible_of(batch)}
 
     def _negative_phase(self, rbm: Any, positive: Configurations) -> NegativePhase[Any]:
         """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""

@@ -62,13 +62,13 @@ class BoltzmannPretraining(EnergyPretraining):
         """One optimiser for all parameters of the machine."""
         return self.make_optimizer(self.model.parameters())
 
-    def positive_phase(self, batch: Batch) -> PositivePhase:
-        """The images, and the hidden units given them."""
-        return self.positive.sample(self.model, batch.v, generator=self.streams["positive_phase"])
+    def visible_of(self, batch: Batch) -> Tensor:
+        """The images."""
+        return batch.v
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """Return held-out images ``v``, for the callbacks."""
-        return {"v": batch.v}
+    def infer(self, v: Tensor) -> PositivePhase:
+        """The images, each perhaps several times, with hidden units."""
+        return self.positive.sample(self.model, v, generator=self.streams["positive_phase"])
 
 
 class DBMPretraining(BoltzmannPretraining):

@@ -84,13 +84,13 @@ class DBNPretraining(EnergyPretraining):
         """One optimiser a layer, so that momentum and adaptive rates start afresh."""
         return [self.make_optimizer(rbm.parameters()) for rbm in self.dbn]
 
-    def positive_phase(self, batch: Batch) -> PositivePhase:
-        """The layer's visible states, and the hidden means given them."""
-        return PositivePhase(positive_phase(self.rbm, self.dbn.visible_of(self.layer, batch.v)), {})
+    def visible_of(self, batch: Batch) -> Tensor:
+        """Mean activations of the layers below."""
+        return self.dbn.visible_of(self.layer, batch.v)
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """Return the layer's visible states ``v`` of held-out images, for the callbacks."""
-        return {"v": self.dbn.visible_of(self.layer, batch.v)}
+    def infer(self, v: Tensor) -> PositivePhase:
+        """The hidden means."""
+        return PositivePhase(positive_phase(self.rbm, v), {})
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Those of the other layers."""

@@ -89,6 +89,7 @@ MODE = ModeAssisted(
 )
 
 
+@pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`")
 @pytest.mark.parametrize("sampler", [PCD(n_chains=7), MODE], ids=["PCD", "mode-assisted PCD"])
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, sampler: Any) -> None:
     def module(iterations: int) -> DBMPretraining:
@@ -97,12 +98,10 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, sampler: Any) ->
     whole, half, rest = module(6), module(6), module(6)
     fit(whole, [])
 
-    def keep() -> ModelCheckpoint:
-        return ModelCheckpoint(dirpath=tmp_path, filename="half", every_n_epochs=3, save_on_train_epoch_end=True)
-
     half.iterations = 3
-    fit(half, [keep()])
-    fit(rest, [keep()], ckpt_path=tmp_path / "half.ckpt", weights_only=True)
+    keep = ModelCheckpoint(dirpath=tmp_path, filename="half", every_n_epochs=3, save_on_train_epoch_end=True)
+    fit(half, [keep])
+    fit(rest, [], ckpt_path=tmp_path / "half.ckpt", weights_only=True)
     for name, tensor in whole.state_dict().items():
         assert tensor.equal(rest.state_dict()[name]), name
 
