@@ -20,8 +20,15 @@ from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
-from memcomp_lightning.models import DBN, Randomiser
-from memcomp_lightning.modules import Classifier, DBNClassifier, OptimizerFactory, StageModule
+from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser
+from memcomp_lightning.modules import (
+    BoltzmannPretraining,
+    Classifier,
+    DBNClassifier,
+    EnergyPretraining,
+    OptimizerFactory,
+    StageModule,
+)
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
@@ -88,12 +95,13 @@ def build(config: DictConfig) -> Plan:
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = None
-    if isinstance(network, DBN) and config.pretrain.iterations > 0:
+    if isinstance(network, DBN | BoltzmannMachine) and config.pretrain.iterations > 0:
         callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
         centring = instantiate(config.pretrain.centring)
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         make = instantiate(config.pretrain.module)
+        _check_module(make, network)
         try:
             module = make(
                 network,
@@ -107,6 +115,13 @@ def build(config: DictConfig) -> Plan:
             raise UserError(f"pretrain.module: {error}") from error
         pretraining = Stage(module, data, callbacks)
     if config.finetune.iterations > 0:
+        require(
+            not isinstance(network, BoltzmannMachine),
+            "finetune.iterations",
+            config.finetune.iterations,
+            "0 for a Boltzmann machine, which is no feed-forward network",
+            "For a deep one that is fine-tuned use model=dbn pretrain=joint.",
+        )
         callbacks = _callbacks(config, "finetune")
         require(
             config.data.validation_fraction > 0 or not any(isinstance(c, BestWeights) for c in callbacks),
@@ -147,6 +162,17 @@ def build(config: DictConfig) -> Plan:
     return plan
 
 
+def _check_module(make: Any, network: nn.Module) -> None:
+    """Each model has its way of pretraining."""
+    kind = getattr(make, "func", None)
+    of_machines = isinstance(network, BoltzmannMachine)
+    fits = isinstance(kind, type) and issubclass(kind, EnergyPretraining)
+    fits = fits and (kind is BoltzmannPretraining) == of_machines
+    allowed = "pretrain=boltzmann" if of_machines else "pretrain=greedy, centred or joint"
+    name = getattr(kind, "__name__", make)
+    require(fits, "pretrain.module", name, f"one for {type(network).__name__}: {allowed}")
+
+
 def _network(config: DictConfig, images: ImageData) -> nn.Module:
     settings = OmegaConf.to_container(config.model, resolve=True)
     assert isinstance(settings, dict)
@@ -159,8 +185,10 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
         "replicas": (min(partitions, first or partitions),) if partitions > 1 else (),
         "generator": rng.stream(config.seed, "weights"),
     }
+    if isinstance(settings.get("connectivity"), dict):
+        settings["connectivity"] = {**settings["connectivity"], "n_visible": images.layout.n_visible}
     factory = instantiate(settings, _partial_=True, _convert_="all")
-    if not issubclass(get_class(settings["_target_"]), DBN):
+    if not issubclass(get_class(settings["_target_"]), DBN | BoltzmannMachine):
         arguments["n_classes"] = images.n_classes
     try:
         network: nn.Module = factory(**arguments)

@@ -20,6 +20,7 @@ from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import (
+    BoltzmannPretraining,
     Classifier,
     DBMPretraining,
     DBNPretraining,
@@ -160,10 +161,12 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
 
 
 def _trained(stage: Stage) -> torch.nn.Module:
-    """What a stage trains: the DBN, or the network with its output layer."""
+    """What a stage trains: the DBN or machine, or the network with its output layer."""
     module = stage.module
     if isinstance(module, DBNPretraining | DBMPretraining):
         return module.dbn
+    if isinstance(module, BoltzmannPretraining):
+        return module.model
     return cast(Classifier, module).network
 
 

@@ -71,7 +71,8 @@ class BoltzmannMachine(nn.Module):
 
     Args:
         n_visible: Number of visible units, >= 1.
-        n_hidden: Number of hidden units, >= 0.
+        n_hidden: Number of hidden units, >= 0; None is what the pairs of ``connectivity`` have beside the visible
+            ones.
         connectivity: Pairs of units, or a symmetric mask ``(n_units, n_units)``; None couples all. See
             :mod:`memcomp_lightning.models.connectivity` for grids, layers and graphs of annealers.
         replicas: Leading axes of independent machines that share every call.
@@ -91,7 +92,7 @@ class BoltzmannMachine(nn.Module):
     def __init__(
         self,
         n_visible: int,
-        n_hidden: int,
+        n_hidden: int | None = None,
         connectivity: Tensor | Iterable[tuple[int, int]] | None = None,
         *,
         replicas: tuple[int, ...] = (),
@@ -100,6 +101,11 @@ class BoltzmannMachine(nn.Module):
     ) -> None:
         super().__init__()
         require_count("n_visible", n_visible)
+        if n_hidden is None:
+            listed = isinstance(connectivity, Tensor) and connectivity.ndim == 2 and connectivity.shape[1] == 2
+            require(listed, "n_hidden", n_hidden, "a number, unless connectivity is a tensor of pairs")
+            assert isinstance(connectivity, Tensor)
+            n_hidden = int(connectivity.max()) + 1 - n_visible
         require_count("n_hidden", n_hidden, minimum=0)
         n_units = n_visible + n_hidden
         pairs = _pairs_of(n_units, connectivity)

@@ -56,7 +56,7 @@ def grid(n_rows: int, n_columns: int) -> Pairs:
 
 
 def from_graph(graph: Any) -> Pairs:
-    """Edges of a networkx graph, nodes numbered in ascending order: ``dwave_networkx.zephyr_graph(2)``, say.
+    """Edges of a networkx graph, nodes numbered in ascending order: ``dwave.graphs.zephyr_graph(2)``, say.
 
     Args:
         graph: Anything with ``nodes`` and ``edges``; the nodes can be sorted.

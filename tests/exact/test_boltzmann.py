@@ -1,10 +1,13 @@
 """Boltzmann machines of any connectivity against RBMs, dense matrices and enumeration."""
 
+import sys
+
 import pytest
 import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian, mean_field
 from memcomp_lightning.models.connectivity import colouring, from_graph, from_mask, from_pairs, full, grid, layered
 from memcomp_lightning.models.enumeration import binary_states
@@ -207,3 +210,26 @@ def test_masks_and_pairs_mean_the_same():
     mask[pairs[:, 0], pairs[:, 1]] = mask[pairs[:, 1], pairs[:, 0]] = 1
     assert from_mask(mask).equal(pairs)
     assert BoltzmannMachine(3, 2, mask).pairs.equal(BoltzmannMachine(3, 2, pairs.flip(0, 1)).pairs)
+
+
+@pytest.mark.parametrize(("kind", "size", "n_units"), [("chimera", 2, 32), ("pegasus", 2, 40), ("zephyr", 3, 336)])
+def test_visible_units_lie_evenly_on_the_graph_of_an_annealer(kind, size, n_units):
+    graphs = pytest.importorskip("dwave.graphs")
+    pairs = annealer_graph(kind, size, n_visible=7)
+    graph = getattr(graphs, f"{kind}_graph")(size)
+    assert (graph.number_of_nodes(), graph.number_of_edges()) == (n_units, len(pairs))
+    model = BoltzmannMachine(7, None, pairs)
+    assert model.n_units == n_units
+    degree = torch.bincount(pairs.flatten(), minlength=n_units)
+    degrees = [graph.degree[node] for node in sorted(graph.nodes)]
+    assert degree.sort().values.tolist() == sorted(degrees)
+    assert degree[:7].tolist() == [degrees[index * n_units // 7] for index in range(7)]
+    with pytest.raises(SettingError, match=f"less than the {n_units} units of {kind} graph {size}"):
+        annealer_graph(kind, size, n_visible=n_units)
+
+
+def test_without_dwave_graphs_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dwave.graphs", None)
+    monkeypatch.delattr("dwave.graphs", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'memcomp-lightning\[dimod\]'"):
+        annealer_graph("zephyr", 2, n_visible=3)

@@ -15,6 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from memcomp_lightning.callbacks import GradientBias, LogLikelihood
 from memcomp_lightning.data import BarsAndStripes, ImageDataModule
+from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBM, DBN, BoltzmannMachine, Gaussian
 from memcomp_lightning.modules import BoltzmannPretraining, DBMPretraining
@@ -159,3 +160,41 @@ def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override
     assert outcome.status != 0
     assert message in outcome.err
     assert not Path("run").exists()
+
+
+def test_a_machine_on_the_graph_of_an_annealer_is_trained_and_resumed(memcomp_train: Run) -> None:
+    small = [
+        "model.connectivity.size=1",
+        "pretrain.iterations=2",
+        "solver.n_restarts=3",
+        "sampler.schedule.delay=-9",
+    ]
+    outcome = memcomp_train("experiment=annealer_graph", "data=digits", *small, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    result = json.loads(Path("run/result.json").read_text())
+    assert result["stages"]["pretrain"]["trained"] == ["jointly"]
+    weights = torch.load("run/weights/pretrain.pt", weights_only=True)
+    model = BoltzmannMachine(32, None, annealer_graph("zephyr", 1, n_visible=32))
+    model.load_state_dict(weights)
+    assert model.n_units == 48
+    assert memcomp_train("resume=run").status == 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["model=boltzmann", "pretrain=boltzmann"], "0 for a Boltzmann machine"),
+        (["model=boltzmann", "finetune.iterations=0"], "one for BoltzmannMachine: pretrain=boltzmann"),
+        (["pretrain=boltzmann"], "one for DBN: pretrain=greedy, centred or joint"),
+        (
+            ["model=zephyr", "pretrain=boltzmann", "finetune.iterations=0", "model.connectivity.kind=zefyr"],
+            "kind = 'zefyr'",
+        ),
+    ],
+)
+def test_models_and_pretraining_that_do_not_fit_are_refused(
+    memcomp_train: Run, overrides: list[str], message: str
+) -> None:
+    outcome = memcomp_train("data=digits", "sampler=pcd", *overrides, "hydra.run.dir=run")
+    assert outcome.status != 0
+    assert message in outcome.err
