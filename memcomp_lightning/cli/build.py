@@ -66,7 +66,18 @@ class Plan:
 
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
-_GROUPS = ("data", "model", "solver", "sampler", "pretrain", "finetune", "trainer", "logger", "callbacks")
+_GROUPS = (
+    "data",
+    "model",
+    "solver",
+    "sampler",
+    "positive",
+    "pretrain",
+    "finetune",
+    "trainer",
+    "logger",
+    "callbacks",
+)
 _SETTINGS = {
     "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),

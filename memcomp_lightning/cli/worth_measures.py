@@ -10,19 +10,25 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.gradient_bias import MAX_UNITS, compared, gradient
+from memcomp_lightning.callbacks.log_likelihood import MOST_HIDDEN
 from memcomp_lightning.errors import require
 from memcomp_lightning.likelihood import (
     Ais,
     ReverseAis,
     base_of,
+    base_on_first_class,
+    folded,
     kl_divergence,
     log_likelihood,
+    log_likelihood_bound,
     log_partition_function,
 )
-from memcomp_lightning.models import RBM
+from memcomp_lightning.models import RBM, BoltzmannMachine
+from memcomp_lightning.models.enumeration import n_enumerated
 from memcomp_lightning.modules.stage import LARGEST_WEIGHT
 from memcomp_lightning.replicas import Pass
 from memcomp_lightning.samplers import Exact, ModeAssisted, gibbs, positive_phase
+from memcomp_lightning.samplers.gibbs import has_classes
 from memcomp_lightning.types import Configurations
 
 FANTASY_SWEEPS = 200
@@ -77,10 +83,11 @@ def _ais(data: Any, n_reported: int) -> Measure:
 
     def measure(rbm: RBM) -> Scores:
         up = ais.estimate(rbm, generator=rng.stream(0, "ais"), base=base)
-        samples, generator = v[: ais.n_chains].expand(*rbm.replicas, -1, -1), rng.stream(0, "fantasies")
+        start, generator = v[: ais.n_chains].expand(*rbm.replicas, -1, -1), rng.stream(0, "fantasies")
+        two_layers, base_of_two, samples = _of_two_layers(rbm, base, start, generator)
         for _ in range(FANTASY_SWEEPS):
-            samples = gibbs.sweep(rbm, samples, generator=generator)
-        down = ReverseAis().estimate(rbm, samples, generator=rng.stream(0, "reverse ais"), base=base)
+            samples = gibbs.sweep(two_layers, samples, generator=generator)
+        down = ReverseAis().estimate(two_layers, samples, generator=rng.stream(0, "reverse ais"), base=base_of_two)
         return Scores(negative(rbm, up.log_z), negative(rbm, down.log_z))
 
     return measure
@@ -94,6 +101,14 @@ MEASURES: Mapping[str, Callable[[Any, int], Measure]] = {
 """Exact divergence; exact log-likelihood (smaller layer up to 25 units); log-likelihood by AIS both ways."""
 
 
+def _of_two_layers(model: Any, base: Tensor, v: Tensor, generator: Generator) -> tuple[RBM, Tensor, Tensor]:
+    """An RBM, its base and where its chains start; a DBM is the RBM between its odd and its even layers."""
+    if not isinstance(model, BoltzmannMachine):
+        return model, base, v
+    x = torch.cat((v, rng.bernoulli(model.hidden_mean(v), generator=generator)), dim=-1)
+    return folded(model), base_on_first_class(model, base), x[..., model.classes[0]]
+
+
 def _negative_log_likelihood(data: Any, n_reported: int) -> Callable[[RBM, Tensor], Tensor]:
     require(
         data.validation is not None,
@@ -104,7 +119,9 @@ def _negative_log_likelihood(data: Any, n_reported: int) -> Callable[[RBM, Tenso
     test_v, (held_out_v, _) = data.images.test_v, data.validation
 
     def negative(rbm: RBM, log_z: Tensor) -> Tensor:
-        by_test, by_held_out = (-log_likelihood(rbm, v, log_z).mean(-1) for v in (test_v, held_out_v))
+        bounded = isinstance(rbm, BoltzmannMachine) and rbm.n_hidden > MOST_HIDDEN
+        log_p: Any = log_likelihood_bound if bounded else log_likelihood
+        by_test, by_held_out = (-log_p(rbm, v, log_z).mean(-1) for v in (test_v, held_out_v))
         return torch.cat([by_test[:n_reported], by_held_out[n_reported:]])
 
     return negative
@@ -127,13 +144,14 @@ def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Ten
     """Cosine and relative error of a sampler's mean gradient against the exact one, ``(*replicas,)`` each.
 
     Of the mean over some draws from the sampler's present state: noise of the draws is small in it, that of where
-    persistent chains are is not. NaN where the smaller layer is too large.
+    persistent chains are is not. NaN where the model is too large, and where one of its layers is in training.
     """
     exact, generator = Exact(max_units=MAX_UNITS), rng.stream(done.number, "gradient bias")
-    if min(rbm.n_visible, rbm.n_hidden) > exact.max_units:
+    sizes = (done.positive.v.shape[-1], done.positive.h.shape[-1])
+    if n_enumerated(rbm) > exact.max_units or sizes != (rbm.n_visible, rbm.n_hidden):
         nothing = torch.full(rbm.replicas, math.nan)
         return nothing, nothing
-    positive = positive_phase(rbm, done.positive.v)
+    positive = done.positive if has_classes(rbm) else positive_phase(rbm, done.positive.v)
     true = mean_gradient(rbm, exact, exact.init(rbm, 1, generator=generator), positive, 1, generator=generator)
     mean = mean_gradient(rbm, sampler, done.state, positive, n_draws, generator=generator)
     return compared(mean, true)

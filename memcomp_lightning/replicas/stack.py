@@ -31,7 +31,10 @@ def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     states = [network.state_dict() for network in networks]
     shapes = [{name: tuple(x.shape) for name, x in state.items()} for state in states]
     require(all(shape == shapes[0] for shape in shapes), "networks", shapes, "networks of one shape")
-    for name, tensor in [*whole.named_parameters(), *whole.named_buffers()]:
+    # Buffers that are no state are indices, the same in all replicas.
+    tensors = {**dict(whole.named_parameters()), **dict(whole.named_buffers())}
+    for name in states[0]:
+        tensor = tensors[name]
         own_axes = tensor.shape[len(replicas) :]
         tensor.data = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
     return whole

@@ -17,7 +17,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.learning_rate_decay import set_learning_rate
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.models import DBN, RBM
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine
 from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy, joined
 from memcomp_lightning.modules.stage import diverged_parameter
 from memcomp_lightning.objective import Centring, Offsets, contrast
@@ -145,23 +145,46 @@ def pretrain_jointly(
     Raises:
         DivergedError: A parameter left the finite numbers.
     """
-    require_count("iterations", iterations, minimum=0)
     dbm = joined(dbn)
-    device = dbm.b.device
+    for _ in pretrain_machine(
+        dbm, batches, sampler, positive, iterations=iterations, rates=rates, centring=centring, seed=seed
+    ):
+        pass
+    dbm.give(dbn)
+
+
+def pretrain_machine(
+    model: BoltzmannMachine,
+    batches: Batches,
+    sampler: NegativePhaseSampler[Any, Any],
+    positive: PositivePhaseSampler,
+    *,
+    iterations: int,
+    rates: Rates,
+    centring: Centring | None = None,
+    seed: int = 0,
+) -> Iterator[Pass]:
+    """Train a Boltzmann machine in place, as ``BoltzmannPretraining`` does; yield each pass once it is done.
+
+    Arguments are those of :func:`pretrain`, with what supplies the hidden units given the data.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations, minimum=0)
+    device = model.b.device
     of_data = rng.stream(seed, "positive_phase", device=device)
-    for _ in _follow_contrast(
-        dbm,
-        lambda v: positive.sample(dbm, v, generator=of_data).configurations,
+    yield from _follow_contrast(
+        model,
+        lambda v: positive.sample(model, v, generator=of_data).configurations,
         batches,
         sampler,
         passes=range(iterations),
         rates=rates,
         centring=centring,
         generator=rng.stream(seed, "negative_phase", device=device),
-    ):
-        pass
-    _check_finite(dbm, "joint pretraining")
-    dbm.give(dbn)
+    )
+    _check_finite(model, "pretraining")
 
 
 def _follow_contrast(

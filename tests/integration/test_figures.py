@@ -78,7 +78,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
 
 @pytest.mark.parametrize("sampler", ["cd", "pcd", "dmm_qubo"])
 def test_a_replica_trained_jointly_is_the_single_run(memcomp_train: Run, sampler: str) -> None:
-    joint = ["pretrain=joint", f"sampler={sampler}", "pretrain.module.positive.max_iterations=5"]
+    joint = ["pretrain=joint", f"sampler={sampler}", "positive.max_iterations=5"]
     curve = f"+figure.curves.joint={{label: joint, overrides: {[*joint]}}}"
     figure = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[3]", "figure.seeds=[5]", curve]
     outcome = memcomp_train(*figure, "hydra.run.dir=run")

@@ -148,8 +148,8 @@ def test_joint_and_greedy_from_the_command_line(memcomp_train: Run) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("pretrain.module.positive.max_iterations=0", "max_iterations = 0"),
-        ("pretrain.module.positive.tolerance=-1", "tolerance = -1"),
+        ("positive.max_iterations=0", "max_iterations = 0"),
+        ("positive.tolerance=-1", "tolerance = -1"),
         ("+pretrain.module.posterior=1", "posterior"),
         ("sampler.n_chains=0", "n_chains = 0"),
         ("sampler=exact", "units outside the largest class = 32"),
