@@ -17,13 +17,12 @@ from memcomp_lightning.likelihood import (
     ReverseAis,
     base_of,
     base_on_first_class,
-    folded,
     kl_divergence,
     log_likelihood,
     log_likelihood_bound,
     log_partition_function,
 )
-from memcomp_lightning.models import RBM, BoltzmannMachine
+from memcomp_lightning.models import RBM, BoltzmannMachine, folded
 from memcomp_lightning.models.enumeration import n_enumerated
 from memcomp_lightning.modules.stage import LARGEST_WEIGHT
 from memcomp_lightning.replicas import Pass

@@ -1,7 +1,7 @@
 """How likely data are under an energy model: log Z by enumeration or annealing, and what follows from it."""
 
 from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, base_of
-from memcomp_lightning.likelihood.boltzmann import base_on_first_class, folded, log_likelihood_bound
+from memcomp_lightning.likelihood.boltzmann import base_on_first_class, log_likelihood_bound
 from memcomp_lightning.likelihood.exact import (
     exact_samples,
     kl_divergence,
@@ -17,7 +17,6 @@ __all__ = [
     "base_of",
     "base_on_first_class",
     "exact_samples",
-    "folded",
     "kl_divergence",
     "log_likelihood",
     "log_likelihood_bound",

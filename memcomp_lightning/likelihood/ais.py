@@ -13,8 +13,8 @@ from tqdm.auto import tqdm
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.likelihood.boltzmann import base_on_first_class, folded
-from memcomp_lightning.models.boltzmann import BoltzmannMachine
+from memcomp_lightning.likelihood.boltzmann import base_on_first_class
+from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor

@@ -12,39 +12,9 @@ from memcomp_lightning.likelihood.layers import softplus
 from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.mean_field import hidden_blocks, mean_field
-from memcomp_lightning.models.rbm import RBM
 
 _NUMBERS = 2**23
 """float64 numbers held at a time."""
-
-
-@torch.no_grad()
-def folded(model: BoltzmannMachine) -> RBM:
-    """The RBM between the two classes of a machine that has two, the units of the first as its visible ones.
-
-    Its partition function is that of the machine; of a DBM, it has the odd layers on one side and the even ones on
-    the other (Salakhutdinov & Hinton 2009).
-
-    Raises:
-        SettingError: The machine has more classes, or one.
-    """
-    blocks = model.blocks()
-    require(
-        len(blocks) == 2,
-        "number of classes of units",
-        len(blocks),
-        "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
-        "Other machines can be enumerated up to 32 units outside the largest class.",
-    )
-    first, second = blocks
-    rbm = RBM(len(first.units), len(second.units), replicas=model.replicas)
-    rbm.to(model.b)
-    weight = torch.zeros_like(rbm.weight)
-    weight[..., torch.searchsorted(first.units, second.neighbours)] = second.weight
-    rbm.weight.copy_(weight)
-    rbm.b.copy_(first.bias)
-    rbm.c.copy_(second.bias)
-    return rbm
 
 
 def base_on_first_class(model: BoltzmannMachine, base: Tensor) -> Tensor:

@@ -9,13 +9,12 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import (
-    folded,
     log_hidden_sum,
     log_partition_function_by_classes,
 )
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.models.boltzmann import BoltzmannMachine
+from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
 

@@ -1,6 +1,6 @@
 """Energy models and networks, each a ``torch.nn.Module`` on the replica axis."""
 
-from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine
+from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine, folded
 from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
@@ -26,6 +26,7 @@ __all__ = [
     "Shuffled",
     "Uniform",
     "Xavier",
+    "folded",
     "hidden_blocks",
     "mean_field",
     "with_batch_norm_relu",

@@ -13,6 +13,7 @@ from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.models.mean_field import mean_field
+from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
@@ -270,6 +271,35 @@ class BoltzmannMachine(nn.Module):
         h = self.hidden_mean(v)
         negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
         return self.energy(v, h) + negative_entropy
+
+
+@torch.no_grad()
+def folded(model: BoltzmannMachine) -> RBM:
+    """The RBM between the two classes of a machine that has two, the units of the first as its visible ones.
+
+    It has the energies of the machine; of a DBM, it has the odd layers on one side and the even ones on the other
+    (Salakhutdinov & Hinton 2009).
+
+    Raises:
+        SettingError: The machine has more classes, or one.
+    """
+    blocks = model.blocks()
+    require(
+        len(blocks) == 2,
+        "number of classes of units",
+        len(blocks),
+        "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
+        "Other machines can be enumerated up to 32 units outside the largest class.",
+    )
+    first, second = blocks
+    rbm = RBM(len(first.units), len(second.units), replicas=model.replicas)
+    rbm.to(model.b)
+    weight = torch.zeros_like(rbm.weight)
+    weight[..., torch.searchsorted(first.units, second.neighbours)] = second.weight
+    rbm.weight.copy_(weight)
+    rbm.b.copy_(first.bias)
+    rbm.c.copy_(second.bias)
+    return rbm
 
 
 def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | None) -> Pairs:

@@ -7,10 +7,10 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice
-from memcomp_lightning.models.boltzmann import BoltzmannMachine
+from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.qubo.from_model import from_model
-from memcomp_lightning.qubo.qubo import QuboSolution, QuboSolver, Status
+from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, QuboSolver, Status
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 
@@ -51,13 +51,29 @@ class GroundState:
         self, model: RBM | BoltzmannMachine, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return x* or the weighted trajectory."""
-        solution = self.solver.minimise(from_model(model), generator=generator)
+        problem, order = problem_of(model)
+        solution = self.solver.minimise(problem, generator=generator)
         if self.readout == "best":
             x, weight = solution.best.unsqueeze(-2), None
         else:
             x, weight = _visited(solution, model.b.dtype)
+        if order is not None:
+            x = x[..., order]
         v, h = x.split((model.n_visible, model.n_hidden), dim=-1)
         return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
+
+
+def problem_of(model: RBM | BoltzmannMachine) -> tuple[Qubo, Tensor | None]:
+    """The problem of a model, and where in its assignments the model's units are; None if in their places.
+
+    A machine whose couplings fill most of the matrix between two classes, a DBM, is posed as an RBM: solvers are
+    much faster on a matrix than on a list of pairs.
+    """
+    if isinstance(model, BoltzmannMachine):
+        classes = model.classes
+        if len(classes) == 2 and len(model.pairs) > 0.5 * len(classes[0]) * len(classes[1]):
+            return from_model(folded(model)), torch.cat(classes).argsort()
+    return from_model(model), None
 
 
 def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -10,17 +10,17 @@ from memcomp_lightning.likelihood import (
     ReverseAis,
     base_of,
     base_on_first_class,
-    folded,
     kl_divergence,
     log_likelihood,
     log_likelihood_bound,
     log_partition_function,
 )
-from memcomp_lightning.models import DBM, BoltzmannMachine
+from memcomp_lightning.models import DBM, BoltzmannMachine, folded
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import CD, Exact, ExactPosterior, MeanField
+from memcomp_lightning.qubo import BruteForce
+from memcomp_lightning.samplers import CD, Exact, ExactPosterior, GroundState, MeanField
 from memcomp_lightning.testing import small_dbm, small_machine
 from memcomp_lightning.testing.conformance import _with_biases
 
@@ -160,3 +160,17 @@ def test_cd_starts_at_data_and_inferred_hidden_units():
     negative = cd.sample(model, state, positive, generator=generator).configurations
     torch.testing.assert_close(negative.v.mean(0), model.b.detach().sigmoid(), rtol=0, atol=0.02)
     torch.testing.assert_close(negative.h.mean(0), model.c.detach().sigmoid(), rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("make", [small_dbm, small_machine, small_grid])
+@pytest.mark.parametrize("replicas", [(), (2, 3)], ids=str)
+def test_the_ground_state_is_that_of_all_states_whatever_the_layout(make, replicas):
+    """A DBM is solved as a matrix between its two classes of units, others as a list of pairs."""
+    model, generator = make(replicas=replicas).double(), rng.stream(0, "solver")
+    sampler = GroundState(solver=BruteForce())
+    state = sampler.init(model, 1, generator=generator)
+    v = torch.zeros(*replicas, 2, model.n_visible).double()
+    positive = MeanField().sample(model, v, generator=generator)
+    found = sampler.sample(model, state, positive.configurations, generator=generator).configurations
+    lowest = -log_joint(model).flatten(-2).amax(-1)
+    torch.testing.assert_close(model.energy(found.v.double(), found.h.double()).squeeze(-1).detach(), lowest)

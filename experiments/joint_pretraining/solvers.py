@@ -1,0 +1,83 @@
+"""What one ground state of a Boltzmann machine's QUBO costs: the DMM against dwave-samplers' simulated annealing.
+
+python experiments/joint_pretraining/solvers.py               # a DBM, a Zephyr graph, a full machine; minutes
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from dimod import BinaryQuadraticModel
+from dwave.samplers import SimulatedAnnealingSampler
+
+from memcomp_lightning import rng
+from memcomp_lightning.dmm import DmmSolver
+from memcomp_lightning.interop import annealer_graph
+from memcomp_lightning.models import DBM, BoltzmannMachine, Gaussian
+from memcomp_lightning.qubo import Qubo
+from memcomp_lightning.samplers.ground_state import problem_of
+
+STD = 0.3
+"""Of couplings and biases: about where trained machines are."""
+
+MACHINES: dict[str, Callable[[torch.Generator], BoltzmannMachine]] = {
+    "DBM 32-32-32": lambda g: DBM(32, [32, 32], weight_init=Gaussian(std=STD), generator=g),
+    "DBM 784-500-500": lambda g: DBM(784, [500, 500], weight_init=Gaussian(std=STD), generator=g),
+    "Zephyr 3, 336 units": lambda g: BoltzmannMachine(
+        32, None, annealer_graph("zephyr", 3, 32), weight_init=Gaussian(std=STD), generator=g
+    ),
+    "all pairs, 100 units": lambda g: BoltzmannMachine(50, 50, weight_init=Gaussian(std=STD), generator=g),
+}
+
+
+def annealed(qubo: Qubo, reads: int, sweeps: int, seed: int) -> tuple[float, float]:
+    """Lowest energy by simulated annealing, and the seconds, those of building the model left out."""
+    matrix = qubo.to_matrix()
+    model = BinaryQuadraticModel(matrix.double().numpy(), "BINARY")
+    begin = time.perf_counter()
+    found = SimulatedAnnealingSampler().sample(model, num_reads=reads, num_sweeps=sweeps, seed=seed)
+    return float(found.first.energy), time.perf_counter() - begin
+
+
+def by_dmm(qubo: Qubo, solver: DmmSolver, seed: int) -> tuple[float, float]:
+    """Lowest energy by the DMM, and the seconds."""
+    begin = time.perf_counter()
+    found = solver.minimise(qubo, generator=rng.stream(seed, "solver"))
+    return float(found.best_energy), time.perf_counter() - begin
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--instances", type=int, default=5)
+    parser.add_argument("--reads", type=int, default=28, help="of annealing, as many as the DMM has restarts")
+    parser.add_argument("--sweeps", type=int, default=100, help="of annealing")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    print("| machine | couplings | DMM, ms | SA, ms | gap of the DMM to the better | gap of SA |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name, make in MACHINES.items():
+        found: dict[str, list[tuple[float, float]]] = {"dmm": [], "sa": []}
+        for instance in range(given.instances + 1):
+            generator = rng.stream(instance, "machine")
+            model = make(generator)
+            with torch.no_grad():
+                for bias in (model.b, model.c):
+                    bias.normal_(0.0, STD, generator=generator)
+            qubo, _ = problem_of(model)
+            runs = (by_dmm(qubo, DmmSolver(), instance), annealed(qubo, given.reads, given.sweeps, instance))
+            if instance:  # the first one loads what is compiled
+                found["dmm"].append(runs[0])
+                found["sa"].append(runs[1])
+        best = [min(pair[0][0], pair[1][0]) for pair in zip(found["dmm"], found["sa"], strict=True)]
+        cells = [str(len(model.pairs))]
+        cells += [f"{1e3 * statistics.median(seconds for _, seconds in found[who]):.1f}" for who in ("dmm", "sa")]
+        for who in ("dmm", "sa"):
+            gaps = [(energy - low) / abs(low) for (energy, _), low in zip(found[who], best, strict=True)]
+            cells.append(f"{statistics.median(gaps):.2%} (worst {max(gaps):.2%})")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
