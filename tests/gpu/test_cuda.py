@@ -21,11 +21,12 @@ from memcomp_lightning.likelihood import (
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
+from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, EdgeList, Qubo, WeightedMaxSat, from_model
 from memcomp_lightning.qubo.maxsat import Clauses
 from memcomp_lightning.replicas import Rates, finetune, pretrain_layer
-from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench, positive_phase
-from memcomp_lightning.testing.conformance import small_rbm
+from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, MeanField, Quench, positive_phase
+from memcomp_lightning.testing import small_dbm, small_machine, small_rbm
 
 pytestmark = [
     pytest.mark.gpu,
@@ -137,3 +138,26 @@ def test_the_host_waits_for_no_update(sampler, monkeypatch) -> None:
             next(training)
         finally:
             torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.parametrize("make", [small_dbm, small_machine])
+@pytest.mark.parametrize(
+    "sampler",
+    [CD(k=3), PCD(k=2, n_chains=11), Exact(), GroundState(solver=BruteForce())],
+    ids=lambda sampler: type(sampler).__name__,
+)
+def test_machines_of_any_connectivity_draw_the_same_on_both_devices(sampler, make) -> None:
+    answers = []
+    for device in ("cpu", "cuda"):
+        model = make(replicas=(3,)).double().to(device)
+        v = rng.uniform((3, 11, model.n_visible), generator=rng.stream(1, "data"), like=model.b)
+        generator = rng.stream(2, "negative_phase")
+        positive = MeanField().sample(model, v, generator=generator).configurations
+        state = sampler.init(model, 11, generator=generator)
+        negative = sampler.sample(model, state, positive, generator=generator).configurations
+        loss = contrast(model, positive, negative)
+        parts = (*positive, *negative, loss.detach(), log_partition_function(model))
+        assert all(part is None or part.device.type == device for part in parts)
+        answers.append([part.cpu() for part in parts if part is not None])
+    for cpu, cuda in zip(*answers, strict=True):
+        torch.testing.assert_close(cuda, cpu)
