@@ -4,12 +4,16 @@ import time
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.qubo.graph import Bipartite
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status
+
+_NUMBERS = 2**22
+"""Numbers held at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -18,7 +22,7 @@ class BruteForce:
 
     Attributes:
         max_variables: Largest number of variables to enumerate; 2^max_variables states are examined.
-        chunk_size: States examined at a time, >= 1.
+        chunk_size: States examined at a time at most, >= 1; fewer of large problems.
     """
 
     max_variables: int = 22
@@ -45,14 +49,18 @@ class BruteForce:
             "Use a heuristic (DmmSolver, AlternatingDescent), or raise max_variables: each one doubles the time.",
         )
         best_energy = torch.full(qubo.problems, torch.inf, dtype=torch.float64, device=qubo.linear.device)
-        best = qubo.linear.new_zeros(*qubo.problems, qubo.n)
-        for start in range(0, 2**enumerated, self.chunk_size):
-            stop = min(start + self.chunk_size, 2**enumerated)
-            states = self._complete(qubo, binary_states(enumerated, start=start, stop=stop, like=qubo.linear))
-            energies, index = qubo.energy(states).min(-1)
-            chosen = states.take_along_dim(index[..., None, None], dim=-2).squeeze(-2)
-            best = torch.where((energies < best_energy).unsqueeze(-1), chosen, best)
+        best = qubo.linear.new_zeros(*qubo.problems, enumerated)
+        layers = _Layers(qubo) if isinstance(graph, Bipartite) else None
+        at_once = max(1, min(self.chunk_size, _NUMBERS // qubo.linear.numel()))
+        for start in range(0, 2**enumerated, at_once):
+            stop = min(start + at_once, 2**enumerated)
+            states = binary_states(enumerated, start=start, stop=stop, like=qubo.linear)
+            every = states.expand(*qubo.problems, *states.shape)
+            energies, index = (qubo.energy(every) if layers is None else layers.lowest(states)).min(-1)
+            best = torch.where((energies < best_energy).unsqueeze(-1), states[index], best)
             best_energy = torch.minimum(energies, best_energy)
+        if layers is not None:
+            best = layers.completed(best)
         assignments = best.unsqueeze(-2)
         one_each = torch.ones(*qubo.problems, 1, dtype=torch.int64, device=best.device)
         return QuboSolution(
@@ -63,15 +71,31 @@ class BruteForce:
             wall_time_s=time.perf_counter() - begin,
         )
 
-    @staticmethod
-    def _complete(qubo: Qubo, states: Tensor) -> Tensor:
-        """All variables for each enumerated state: the other layer of a bipartite problem is set optimally."""
-        states = states.expand(*qubo.problems, *states.shape)
+
+class _Layers:
+    """A bipartite problem in float64, seen from its smaller layer: the other layer follows, unit by unit."""
+
+    def __init__(self, qubo: Qubo) -> None:
         graph = qubo.graph
-        if not isinstance(graph, Bipartite):
-            return states
-        if graph.n_first <= graph.n_second:
-            other = states @ qubo.coupling.mT + qubo.linear[..., None, graph.n_first :]
-            return torch.cat((states, (other < 0).to(states.dtype)), dim=-1)
-        other = states @ qubo.coupling + qubo.linear[..., None, : graph.n_first]
-        return torch.cat(((other < 0).to(states.dtype), states), dim=-1)
+        assert isinstance(graph, Bipartite)
+        self._first = graph.n_first <= graph.n_second
+        layers = qubo.linear.double().split((graph.n_first, graph.n_second), dim=-1)
+        self._linear, self._other = layers if self._first else layers[::-1]
+        self._coupling = qubo.coupling.double().mT if self._first else qubo.coupling.double()
+        self._offset = qubo.offset.double()
+
+    def lowest(self, states: Float[Tensor, "states n"]) -> Float[Tensor, "*problems states"]:
+        """Energy of each state of the smaller layer with the best state of the other."""
+        states = states.double()
+        # One product for all problems: (states, n) times (n, problems and units).
+        flat = self._coupling.movedim(-2, 0).flatten(1)
+        field = torch.addmm(self._other.flatten(), states, flat).view(len(states), *self._other.shape)
+        own = states @ self._linear.reshape(-1, states.shape[-1]).mT
+        energy: Tensor = field.clamp_(max=0.0).sum(-1) + own.view(len(states), *self._offset.shape) + self._offset
+        return energy.movedim(0, -1)
+
+    def completed(self, state: Float[Tensor, "*problems n"]) -> Float[Tensor, "*problems n_all"]:
+        """One state of the smaller layer for each problem, with the best state of the other."""
+        field = (state.double().unsqueeze(-2) @ self._coupling).squeeze(-2) + self._other
+        other = (field < 0).to(state.dtype)
+        return torch.cat((state, other) if self._first else (other, state), dim=-1)
