@@ -1,0 +1,79 @@
+"""The DMM as a ``dimod.Sampler``: for whoever has a binary quadratic model and dimod's tools."""
+
+import dataclasses
+from typing import Any
+
+import dimod
+import numpy as np
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.dmm import DmmSolver
+from memcomp_lightning.interop.dimod import from_bqm
+from memcomp_lightning.qubo import QuboSolver, Status
+
+
+class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
+    """Answers binary quadratic models of either vartype with the restarts of a solver.
+
+    Args:
+        solver: The solver; None is :class:`DmmSolver` with its defaults.
+
+    >>> answer = DmmDimodSampler().sample(dimod.BQM({"a": 1}, {("a", "b"): -3}, 0.0, "SPIN"), num_reads=3, seed=0)
+    >>> answer.first.energy, len(answer)
+    (-4.0, 3)
+    """
+
+    def __init__(self, solver: QuboSolver | None = None) -> None:
+        self.solver = DmmSolver() if solver is None else solver
+
+    @property
+    def parameters(self) -> dict[str, list[str]]:
+        """Keyword arguments of :meth:`sample`."""
+        return {"num_reads": [], "seed": []}
+
+    @property
+    def properties(self) -> dict[str, Any]:
+        """The solver with its settings."""
+        return {"solver": repr(self.solver)}
+
+    def sample(
+        self,
+        bqm: dimod.BinaryQuadraticModel,
+        *,
+        num_reads: int | None = None,
+        seed: int | None = None,
+        **given: Any,
+    ) -> Any:
+        """Return a SampleSet, one sample a restart, those that were not run left out.
+
+        Args:
+            bqm: The model.
+            num_reads: Restarts; None is the solver's own number.
+            seed: Of the random stream; None takes 0.
+            given: Anything else is reported by a warning, as dimod's samplers do.
+        """
+        self.remove_unknown_kwargs(**given)
+        if not bqm.num_variables:
+            return _sample_set([], bqm)
+        solver: Any = self.solver
+        if num_reads is not None:
+            solver = _with_reads(solver, num_reads)
+        problem, variables = from_bqm(bqm)
+        solution = solver.minimise(problem, generator=rng.stream(0 if seed is None else seed, "solver"))
+        was_run = solution.status != int(Status.NOT_RUN)
+        x = solution.assignments[was_run].to(torch.int8).numpy()
+        if bqm.vartype is dimod.SPIN:
+            x = 2 * x - 1
+        info = {"wall_time_s": solution.wall_time_s, "messages": solution.messages()}
+        return _sample_set((np.ascontiguousarray(x), variables), bqm, info=info)
+
+
+_sample_set: Any = dimod.SampleSet.from_samples_bqm
+
+
+def _with_reads(solver: Any, num_reads: int) -> Any:
+    """The solver with so many restarts."""
+    if not hasattr(solver, "n_restarts"):
+        raise ValueError(f"num_reads = {num_reads}: {type(solver).__name__} has no n_restarts to set.")
+    return dataclasses.replace(solver, n_restarts=num_reads)

@@ -1,0 +1,217 @@
+"""dimod both ways: models, solvers, negative phases, and the DMM under dimod's own tests."""
+
+import sys
+import time
+import unittest
+
+import numpy as np
+import pytest
+import torch
+
+dimod = pytest.importorskip("dimod")
+pytest.importorskip("dwave.samplers")
+
+from dwave.samplers import SimulatedAnnealingSampler, TabuSampler  # noqa: E402
+
+from memcomp_lightning import rng  # noqa: E402
+from memcomp_lightning.dmm import DmmSolver  # noqa: E402
+from memcomp_lightning.errors import SettingError  # noqa: E402
+from memcomp_lightning.interop import (  # noqa: E402
+    AnnealerSamples,
+    DimodSolver,
+    DmmDimodSampler,
+    from_bqm,
+    maximum_pseudo_likelihood_beta,
+    to_bqm,
+)
+from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
+from memcomp_lightning.models.enumeration import binary_states  # noqa: E402
+from memcomp_lightning.qubo import BruteForce, Qubo, Status, from_model  # noqa: E402
+from memcomp_lightning.samplers import positive_phase  # noqa: E402
+from memcomp_lightning.samplers.gibbs import chains_of  # noqa: E402
+from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
+
+SHORT = {"num_reads": 7, "num_sweeps": 50}
+
+
+@pytest.mark.parametrize("problem", ["rbm", "machine", "matrix"])
+def test_a_problem_as_a_model_has_its_energies(problem):
+    matrix = torch.empty(5, 5).normal_(generator=rng.stream(0, "matrix"))
+    qubo = {
+        "rbm": from_model(small_rbm()),
+        "machine": from_model(small_machine()),
+        "matrix": Qubo.from_matrix(matrix, offset=torch.tensor(1.5)),
+    }[problem]
+    x = binary_states(qubo.n, like=qubo.linear)
+    np.testing.assert_allclose(to_bqm(qubo).energies(x.numpy().astype(int)), qubo.energy(x).numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("vartype", ["BINARY", "SPIN"])
+def test_a_model_of_any_labels_as_a_problem_has_its_energies(vartype):
+    bqm = dimod.BinaryQuadraticModel(
+        {"c": 1.0, 3: -2.0, "a": 0.5}, {("a", 3): 2.0, ("c", "a"): -1.5}, 0.25, vartype
+    )
+    qubo, variables = from_bqm(bqm)
+    x = binary_states(3, like=torch.zeros(()))
+    values = x if vartype == "BINARY" else 2 * x - 1
+    expected = bqm.energies((values.numpy().astype(int), variables))
+    np.testing.assert_allclose(qubo.energy(x).numpy(), expected)
+    with pytest.raises(SettingError, match="at least one variable"):
+        from_bqm(dimod.BinaryQuadraticModel("SPIN"))
+
+
+@pytest.mark.filterwarnings("ignore:All bqm biases are zero")
+@pytest.mark.parametrize("sampler", [SimulatedAnnealingSampler(), TabuSampler()], ids=lambda s: type(s).__name__)
+def test_samplers_of_dimod_keep_the_contract_of_a_solver(sampler):
+    parameters = SHORT if isinstance(sampler, SimulatedAnnealingSampler) else {"num_reads": 3, "timeout": 20}
+    check_solver(DimodSolver(sampler=sampler, parameters=parameters), finds_optimum=False)
+
+
+class Fewer(dimod.Sampler):
+    """Returns as many reads as there are variables set in its best answer, aggregated: lengths differ."""
+
+    parameters, properties = {"num_reads": []}, {}
+
+    def sample(self, bqm, num_reads=1):
+        best = dimod.ExactSolver().sample(bqm).first.sample
+        n = 1 + sum(best.values())
+        return dimod.SampleSet.from_samples_bqm(best, bqm).copy() if n == 1 else _repeated(best, bqm, n)
+
+
+def _repeated(sample, bqm, n):
+    return dimod.SampleSet.from_samples_bqm(sample, bqm, num_occurrences=[n])
+
+
+def test_reads_of_different_number_are_marked():
+    qubo = Qubo.from_matrix(torch.stack((torch.eye(3), -torch.eye(3))))
+    solution = DimodSolver(sampler=Fewer()).minimise(qubo, generator=rng.stream(0, "solver"))
+    assert solution.status.tolist() == [
+        [int(Status.STEP_BUDGET), *[int(Status.NOT_RUN)] * 3],
+        [int(Status.STEP_BUDGET)] * 4,
+    ]
+    assert solution.best_energy.tolist() == [0.0, -3.0]
+
+
+@pytest.mark.parametrize("beta", [1.0, "estimate"])
+@pytest.mark.parametrize("make", [small_rbm, small_dbm, small_machine])
+def test_annealers_keep_the_contract_of_a_sampler(make, beta):
+    check_sampler(AnnealerSamples(sampler=SimulatedAnnealingSampler(), parameters=SHORT, beta=beta), make=make)
+
+
+@pytest.mark.parametrize("beta", [0.3, 1.0, 2.5])
+def test_the_inverse_temperature_of_samples_is_found(beta):
+    """Chains at a known temperature; a value off by a tenth would show."""
+    rbm = RBM(7, 5, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "weights"))
+    generator = rng.stream(0, "chains")
+    chains = chains_of(rbm)
+    v = chains.random(4001, generator=generator)
+    for _ in range(50):
+        v = chains.sweep(v, beta=beta, generator=generator)
+    h = rng.bernoulli(rbm.hidden_mean(v, beta=beta), generator=generator)
+    x = torch.cat((v, h), dim=-1).detach()
+    found = maximum_pseudo_likelihood_beta(from_model(rbm).field(x), x)
+    torch.testing.assert_close(found, torch.full((2,), beta).double(), rtol=0.05, atol=0)
+    ground = BruteForce().minimise(from_model(rbm), generator=generator).best.unsqueeze(-2)
+    assert maximum_pseudo_likelihood_beta(from_model(rbm).field(ground), ground).tolist() == pytest.approx(
+        [100, 100]
+    )
+
+
+def test_the_estimate_makes_an_annealer_of_another_temperature_sample_the_model():
+    """The annealer works at beta = 2: given E / 2 it samples exp(-E)."""
+    rbm = small_rbm(5, 3, std=0.7)
+    cold = {"num_reads": 500, "num_sweeps": 60, "beta_range": [0.1, 2.0]}
+    sampler = AnnealerSamples(sampler=SimulatedAnnealingSampler(), parameters=cold, beta="estimate")
+    generator = rng.stream(0, "negative_phase")
+    positive = positive_phase(rbm, torch.zeros(1, 5))
+    state = sampler.init(rbm, 1, generator=generator)
+    for _ in range(30):
+        negative = sampler.sample(rbm, state, positive, generator=generator)
+        state = negative.state
+    assert float(state.beta) == pytest.approx(2.0, rel=0.1)
+    assert float(negative.info["beta_effective"]) == float(state.beta)
+
+
+def test_a_large_model_costs_little():
+    """784 x 500: what is added to an annealer's own time, the least of five."""
+
+    class Instant(dimod.Sampler):
+        parameters, properties = {"num_reads": []}, {}
+
+        def sample(self, bqm, num_reads=10):
+            x = np.zeros((num_reads, bqm.num_variables), dtype=np.int8)
+            energies = np.zeros(num_reads)
+            return dimod.SampleSet.from_samples((x, range(bqm.num_variables)), "BINARY", energies)
+
+    rbm, generator = RBM(784, 500), rng.stream(0, "negative_phase")
+    sampler = AnnealerSamples(sampler=Instant())
+    positive, state = positive_phase(rbm, torch.zeros(1, 784)), sampler.init(rbm, 1, generator=generator)
+    times = []
+    for _ in range(5):
+        begin = time.perf_counter()
+        sampler.sample(rbm, state, positive, generator=generator)
+        times.append(time.perf_counter() - begin)
+    assert min(times) < 0.25  # 50 ms on a quiet machine
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sampler": object()}, "sampler = 'object'"),
+        ({"parameters": {"num_reeds": 3}}, "parameter of SimulatedAnnealingSampler = 'num_reeds'"),
+        ({"parameters": {"num_reads": 0}}, "num_reads = 0"),
+        ({"beta": 0.0}, "beta = 0.0"),
+        ({"beta": "guess"}, "beta = 'guess'"),
+        ({"rate": 0.0}, "rate = 0.0"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(SettingError, match=message):
+        AnnealerSamples(**{"sampler": SimulatedAnnealingSampler(), **settings})
+
+
+def test_without_dimod_the_error_says_what_to_install(monkeypatch):
+    import memcomp_lightning.interop as interop
+
+    monkeypatch.setitem(sys.modules, "dimod", None)
+    monkeypatch.delitem(sys.modules, "memcomp_lightning.interop.dimod")
+    monkeypatch.delattr(interop, "dimod")
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'memcomp-lightning\[dimod\]'"):
+        _ = interop.DimodSolver
+
+
+# --- the DMM as a sampler of dimod ------------------------------------------------------------------------
+
+
+def test_the_dmm_keeps_the_interface_of_dimod():
+    dimod.testing.assert_sampler_api(DmmDimodSampler())
+
+
+@dimod.testing.load_sampler_bqm_tests(DmmDimodSampler)
+class TestDmmDimodSampler(unittest.TestCase):
+    """dimod's own tests of models of all vartypes and types of numbers."""
+
+
+@pytest.mark.parametrize("vartype", ["BINARY", "SPIN"])
+def test_the_dmm_finds_the_optimum_of_models(vartype):
+    bqm = dimod.generators.gnp_random_bqm(11, 0.6, vartype, random_state=0)
+    bqm.relabel_variables({v: f"x{v}" for v in bqm.variables})
+    answer = DmmDimodSampler().sample(bqm, num_reads=9, seed=3)
+    dimod.testing.assert_response_energies(answer, bqm)
+    assert answer.first.energy == pytest.approx(dimod.ExactSolver().sample(bqm).first.energy)
+    assert len(answer) == 9
+    again = DmmDimodSampler().sample(bqm, num_reads=9, seed=3)
+    assert np.array_equal(again.record.sample, answer.record.sample)
+
+
+def test_restarts_that_were_not_run_are_left_out():
+    answer = DmmDimodSampler(DmmSolver(n_restarts=28, patience=4)).sample(dimod.BQM({0: -1.0}, {}, "BINARY"))
+    assert 0 < len(answer) < 28
+
+
+def test_what_is_not_known_is_warned_of_or_refused():
+    bqm = dimod.BQM({0: -1.0}, {}, "BINARY")
+    with pytest.warns(dimod.exceptions.SamplerUnknownArgWarning):
+        DmmDimodSampler().sample(bqm, annealing_time=20)
+    with pytest.raises(ValueError, match="BruteForce has no n_restarts"):
+        DmmDimodSampler(BruteForce()).sample(bqm, num_reads=3)
