@@ -1,22 +1,36 @@
-"""What the README shows runs as it stands there."""
+"""What README and docs show runs as it stands there, and their links lead somewhere."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parents[2] / "README.md"
-SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+SNIPPETS = [
+    pytest.param(snippet, page, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, snippet in enumerate(
+        re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL), start=1
+    )
+]
 
 
-@pytest.mark.parametrize("snippet", SNIPPETS, ids=["train", "own_sampler"])
+@pytest.mark.parametrize(("snippet", "page"), SNIPPETS)
 @pytest.mark.filterwarnings("ignore::UserWarning")  # Lightning's advice on loggers and checkpoints
-def test_snippet_runs(snippet: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snippet_runs(snippet: str, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile(snippet, str(README), "exec"), {"__name__": "readme"})
+    exec(compile(snippet, str(page), "exec"), {"__name__": "documentation"})
 
 
-def test_links_lead_somewhere() -> None:
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README.read_text()) if "://" not in link]
-    assert links
-    assert [link for link in links if not (README.parent / link).exists()] == []
+def test_there_are_snippets() -> None:
+    assert len(SNIPPETS) >= 5
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, *sorted(ROOT.glob("experiments/*/README.md"))], ids=lambda p: p.parent.name
+)
+def test_links_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)]+)\)", page.read_text())
+    paths = [link.split("#")[0] for link in links if "://" not in link]
+    assert [path for path in paths if path and not (page.parent / path).exists()] == []
