@@ -16,13 +16,14 @@ class FreeEnergyGap(pl.Callback):
     F(train) = mean log p(train) - mean log p(held-out)``: the gap is about zero at first, and one that grows is
     overfitting, by so many nats an image. Free energies alone say nothing, and gaps of different models (layers,
     seeds) do not compare in size. Training images are those of the pass's last batches, about ``n_images`` of
-    them, judged by the same model as the held-out ones.
+    them, judged by the same model as the first ``n_images`` held-out ones, the same in each pass.
 
     Args:
-        n_images: Training images a replica to judge, >= 1; whole batches, so that there may be a few more.
+        n_images: Images of either kind a replica to judge, >= 1; of training images whole batches, so that there
+            may be a few more.
     """
 
-    def __init__(self, n_images: int = 1000) -> None:
+    def __init__(self, n_images: int = 500) -> None:
         self.n_images = n_images
         self._train = LastImages(n_images)
         self._heldout: list[tuple[Tensor, int]] = []
@@ -50,9 +51,11 @@ class FreeEnergyGap(pl.Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Free energy of one chunk of held-out images."""
-        v = required(outputs, "v", self)
-        self._heldout.append((_free_energy(pl_module, v).sum(-1), v.shape[-2]))
+        """Free energy of one chunk of held-out images, until there are enough."""
+        missing = self.n_images - sum(n for _, n in self._heldout)
+        if missing > 0:
+            v = required(outputs, "v", self)[..., :missing, :]
+            self._heldout.append((_free_energy(pl_module, v).sum(-1), v.shape[-2]))
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Judge the training images by the same model."""

@@ -93,7 +93,7 @@ class ModelSamples(Pictures):
         seed: Seed of the chains; the same starts each time, so that pictures compare.
     """
 
-    def __init__(self, every: int = 10, n_samples: int = 64, n_sweeps: int = 100, seed: int = 0) -> None:
+    def __init__(self, every: int = 20, n_samples: int = 64, n_sweeps: int = 100, seed: int = 0) -> None:
         super().__init__("samples", every, n_samples)
         require_count("n_sweeps", n_sweeps)
         self.n_sweeps = n_sweeps
