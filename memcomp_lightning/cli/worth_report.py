@@ -4,6 +4,7 @@ import csv
 import io
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,9 +14,15 @@ from torch.utils.tensorboard.summary import hparams
 from memcomp_lightning.files import write_text
 from memcomp_lightning.plotting import plot_worth
 from memcomp_lightning.report import Verdict, markdown
-from memcomp_lightning.report.worth import Course, Worth, worth_table, worth_verdicts
+from memcomp_lightning.report.worth import Worth, worth_table, worth_verdicts
 
 NUMBERS = "sampler_worth.csv"
+MEASURED = {
+    "kl": "KL divergence, nats",
+    "log_likelihood": "negative log-likelihood, nats",
+    "ais": "negative log-likelihood by AIS, nats",
+}
+"""What a measure is called in charts."""
 
 
 def write_worth(worth: Worth, folder: Path) -> tuple[dict[str, Figure], list[Verdict], list[str]]:
@@ -31,44 +38,52 @@ def write_worth(worth: Worth, folder: Path) -> tuple[dict[str, Figure], list[Ver
 
 
 def _write_events(worth: Worth, folder: Path) -> None:
-    """A run for each method at its best rate, a group of charts for each data set, settings in the HParams tab."""
+    """A run for each method at its best rates, a group of charts for each data set, settings in the HParams tab.
+
+    One run for all data sets: TensorBoard shows nothing at first where there are more than forty.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     charts = {}
     for data_set in worth.data_sets:
-        measure = worth.plan["data_sets"][data_set]["measure"]
+        settings = worth.plan["data_sets"][data_set]
+        measure = settings["measure"]
+        name = MEASURED[measure]
         tags = {
-            f"{measure}, median over replicas": [f"{data_set}/{measure}/median"],
-            f"{measure}, worst replica": [f"{data_set}/{measure}/worst"],
+            f"{name}: median over replicas": [f"{data_set}/{measure}/median"],
+            f"{name}: worst replica": [f"{data_set}/{measure}/worst"],
             "gradient: cosine with the exact one": [f"{data_set}/gradient/cosine"],
             "gradient: relative error": [f"{data_set}/gradient/relative_error"],
         }
-        charts[worth.plan["data_sets"][data_set]["label"]] = {
-            title: ["Multiline", names] for title, names in tags.items()
-        }
-        for method in worth.methods(data_set):
-            _write_course(worth, worth.best(data_set, method), measure, folder)
+        charts[settings["label"]] = {title: ["Multiline", names] for title, names in tags.items()}
+    for method, settings in worth.plan["methods"].items():
+        found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
+        if found:
+            with SummaryWriter(str(folder / settings["label"])) as writer:
+                _write_method(worth, method, found, writer)
     with SummaryWriter(str(folder)) as writer:
         writer.add_custom_scalars(charts)
 
 
-def _write_course(worth: Worth, course: Course, measure: str, folder: Path) -> None:
-    scores, cosines, errors = (worth.values(course, name) for name in ("scores", "cosines", "errors"))
-    values = {
-        f"{course.data_set}/{measure}/median": np.median(scores, axis=1),
-        f"{course.data_set}/{measure}/worst": scores.max(axis=1),
-        f"{course.data_set}/gradient/cosine": np.median(cosines, axis=1),
-        f"{course.data_set}/gradient/relative_error": np.median(errors, axis=1),
-        f"{course.data_set}/seconds": np.array(course.seconds),
-    }
-    label = worth.plan["methods"][course.method]["label"]
-    with SummaryWriter(str(folder / f"{label}" / course.data_set)) as writer:
+def _write_method(worth: Worth, method: str, data_sets: list[str], writer: SummaryWriter) -> None:
+    settings, final = {"method": worth.plan["methods"][method]["label"]}, {}
+    for data_set in data_sets:
+        course, measure = worth.best(data_set, method), worth.plan["data_sets"][data_set]["measure"]
+        scores, cosines, errors = (worth.values(course, name) for name in ("scores", "cosines", "errors"))
+        values = {
+            f"{data_set}/{measure}/median": np.median(scores, axis=1),
+            f"{data_set}/{measure}/worst": scores.max(axis=1),
+            f"{data_set}/gradient/cosine": np.median(cosines, axis=1),
+            f"{data_set}/gradient/relative_error": np.median(errors, axis=1),
+            f"{data_set}/seconds": np.array(course.seconds),
+        }
         for tag, curve in values.items():
             for updates, value in zip(course.updates, curve, strict=True):
                 writer.add_scalar(tag, value, updates)
-        settings = {"data": course.data_set, "method": label, "learning_rate": course.rate}
-        final = {"final/median": float(values[f"{course.data_set}/{measure}/median"][-1])}
-        final |= {"final/worst": float(scores[-1].max()), "final/seconds": course.seconds[-1]}
-        for summary in hparams(settings, final):
-            writer.file_writer.add_summary(summary)
-        for name, value in final.items():
-            writer.add_scalar(name, value, course.updates[-1])
+        end = worth.end(data_set, method)
+        settings[f"learning_rate/{data_set}"] = end.rate
+        for name in ("median", "worst", "seconds"):
+            final[f"final/{data_set}/{name}"] = getattr(end, name)
+            writer.add_scalar(f"final/{data_set}/{name}", getattr(end, name), course.updates[-1])
+    file_writer: Any = writer.file_writer
+    for summary in hparams(settings, final):
+        file_writer.add_summary(summary)

@@ -65,7 +65,7 @@ def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -
 
     for name in ("shifting_bars.png", "shifting_bars.svg", "sampler_worth.csv", "verdicts.md", "report.html"):
         assert Path("run", name).stat().st_size > 0
-    events = EventAccumulator("run/tensorboard/CD-1/shifting_bars").Reload()
+    events = EventAccumulator("run/tensorboard/CD-1").Reload()
     median = events.Scalars("shifting_bars/kl/median")
     best = read_worth(Path("run")).best("shifting_bars", "cd1")
     assert [event.step for event in median] == best.updates
