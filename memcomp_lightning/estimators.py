@@ -84,7 +84,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, _OnUnitInter
         n_iter_: Passes done.
 
     >>> import numpy as np
-    >>> MemcompRBM(n_components=2, n_iter=3).fit_transform(np.eye(4)).shape
+    >>> MemcompRBM(n_components=2, n_iter=3, random_state=0).fit_transform(np.eye(4)).shape
     (4, 2)
     """
 

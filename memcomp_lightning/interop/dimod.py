@@ -30,7 +30,7 @@ def to_bqm(qubo: Qubo) -> BinaryQuadraticModel:
     Raises:
         SettingError: Several problems at once.
 
-    >>> to_bqm(Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))).energy({0: 1, 1: 1})
+    >>> float(to_bqm(Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))).energy({0: 1, 1: 1}))
     -1.0
     """
     require(qubo.problems == (), "problems", qubo.problems, "one problem, without leading axes")

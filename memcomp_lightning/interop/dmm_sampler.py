@@ -20,7 +20,7 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         solver: The solver; None is :class:`DmmSolver` with its defaults.
 
     >>> answer = DmmDimodSampler().sample(dimod.BQM({"a": 1}, {("a", "b"): -3}, 0.0, "SPIN"), num_reads=3, seed=0)
-    >>> answer.first.energy, len(answer)
+    >>> float(answer.first.energy), len(answer)
     (-4.0, 3)
     """
 

@@ -51,7 +51,10 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
     assert "data.chunk_size = 1000 is not allowed: expected at least the 1437 images of an update" in outcome.err
 
 
-MANY_RUNS = ("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "sampler_worth")
+MANY_RUNS = (
+    *("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "joint"),
+    *("sampler_worth", "joint_likelihood"),
+)
 """Experiments with tests of their own."""
 
 
@@ -83,7 +86,7 @@ def test_baseline_and_partitions_report_mean_and_error(memcomp_train: Run) -> No
 def test_help_names_groups_and_examples(memcomp_train: Run) -> None:
     outcome = memcomp_train("--help")
     assert outcome.status == 0
-    assert "sampler: cd, dmm_qubo" in outcome.out
+    assert "sampler: annealer, cd, dmm_qubo" in outcome.out
     assert "resume=RUN_FOLDER" in outcome.out
 
 

@@ -14,13 +14,14 @@ from running import Outcome
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from memcomp_lightning.callbacks import GradientBias, LogLikelihood
-from memcomp_lightning.data import BarsAndStripes, ImageDataModule
+from memcomp_lightning.data import BarsAndStripes, ImageDataModule, ShiftingBars
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
-from memcomp_lightning.models import DBM, DBN, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian
 from memcomp_lightning.modules import BoltzmannPretraining, DBMPretraining
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.qubo import BruteForce
+from memcomp_lightning.report.worth import Courses, weights_path
 from memcomp_lightning.samplers import (
     PCD,
     ClampedGibbs,
@@ -198,3 +199,46 @@ def test_models_and_pretraining_that_do_not_fit_are_refused(
     outcome = memcomp_train("data=digits", "sampler=pcd", *overrides, "hydra.run.dir=run")
     assert outcome.status != 0
     assert message in outcome.err
+
+
+def test_joint_against_greedy_pretraining_is_a_figure(memcomp_train: Run) -> None:
+    small = [
+        "data=digits",
+        "data.partitions=2",
+        "figure.iterations=[2]",
+        "figure.controls_at=[2]",
+        "figure.passes=[1]",
+    ]
+    outcome = memcomp_train("experiment=joint", *small, "figure.workers=1", "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert "joint, PCD-1 with mean field is above greedy, PCD-1" in outcome.out
+    assert Path("run/joint_controls.png").stat().st_size > 0
+
+
+def test_deep_and_full_machines_are_compared_by_their_likelihood(memcomp_train: Run) -> None:
+    """Layer by layer, from a greedy start, all pairs coupled: as many passes each; models are loaded again."""
+    methods = ["rbm_pcd", "greedy_pcd", "joint_pcd_greedy_start", "full_mode_dmm"]
+    outcome = memcomp_train(
+        "experiment=joint_likelihood",
+        "worth.only=[shifting_bars]",
+        f"+worth.data_sets.shifting_bars.methods=[{','.join(methods)}]",
+        "worth.data_sets.shifting_bars.passes=20",
+        *["worth.rates=[0.5]", "worth.replicas=2", "worth.choosing=1", "worth.points=3", "worth.workers=1"],
+        "worth.claimed=[joint_pcd_greedy_start]",
+        "hydra.run.dir=run",
+    )
+    assert outcome.status == 0, outcome.err
+    v = ShiftingBars().load().train_v
+    models: dict[str, Any] = {
+        "rbm_pcd": RBM(9, 10, replicas=(3,)),
+        "greedy_pcd": DBM(9, [6, 6], replicas=(3,)),
+        "joint_pcd_greedy_start": DBM(9, [6, 6], replicas=(3,)),
+        "full_mode_dmm": BoltzmannMachine(9, 5, replicas=(3,)),
+    }
+    courses = Courses(Path("run")).all
+    assert [course.method for course in courses] == methods
+    for course in courses:
+        assert course.updates[-1] == 20
+        model = models[course.method]
+        model.load_state_dict(torch.load(weights_path(Path("run"), course), weights_only=True))
+        assert course.scores[-1] == pytest.approx(kl_divergence(model, v).tolist(), rel=1e-5)
