@@ -18,10 +18,6 @@ from memcomp_lightning.callbacks.base import (
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
-from memcomp_lightning.samplers.gibbs import has_classes
-
-MOST_HIDDEN = 16
-"""Hidden units of a Boltzmann machine beyond which the mean-field bound stands for the likelihood."""
 
 
 class LogLikelihood(EveryIterations):
@@ -149,6 +145,4 @@ class LogLikelihood(EveryIterations):
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
         log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
         v = rng.bernoulli(v, generator=bits)
-        bounded = has_classes(rbm) and rbm.n_hidden > MOST_HIDDEN
-        log_p = (likelihood.log_likelihood_bound if bounded else likelihood.log_likelihood)(rbm, v, log_z)
-        return log_p.double().sum(-1)
+        return likelihood.log_likelihood_or_bound(rbm, v, log_z).double().sum(-1)

@@ -10,7 +10,6 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.gradient_bias import MAX_UNITS, compared, gradient
-from memcomp_lightning.callbacks.log_likelihood import MOST_HIDDEN
 from memcomp_lightning.errors import require
 from memcomp_lightning.likelihood import (
     Ais,
@@ -18,8 +17,7 @@ from memcomp_lightning.likelihood import (
     base_of,
     base_on_first_class,
     kl_divergence,
-    log_likelihood,
-    log_likelihood_bound,
+    log_likelihood_or_bound,
     log_partition_function,
 )
 from memcomp_lightning.models import RBM, BoltzmannMachine, folded
@@ -118,9 +116,7 @@ def _negative_log_likelihood(data: Any, n_reported: int) -> Callable[[RBM, Tenso
     test_v, (held_out_v, _) = data.images.test_v, data.validation
 
     def negative(rbm: RBM, log_z: Tensor) -> Tensor:
-        bounded = isinstance(rbm, BoltzmannMachine) and rbm.n_hidden > MOST_HIDDEN
-        log_p: Any = log_likelihood_bound if bounded else log_likelihood
-        by_test, by_held_out = (-log_p(rbm, v, log_z).mean(-1) for v in (test_v, held_out_v))
+        by_test, by_held_out = (-log_likelihood_or_bound(rbm, v, log_z).mean(-1) for v in (test_v, held_out_v))
         return torch.cat([by_test[:n_reported], by_held_out[n_reported:]])
 
     return negative

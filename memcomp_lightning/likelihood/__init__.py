@@ -6,6 +6,7 @@ from memcomp_lightning.likelihood.exact import (
     exact_samples,
     kl_divergence,
     log_likelihood,
+    log_likelihood_or_bound,
     log_partition_function,
     log_pseudo_likelihood,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "kl_divergence",
     "log_likelihood",
     "log_likelihood_bound",
+    "log_likelihood_or_bound",
     "log_partition_function",
     "log_pseudo_likelihood",
 ]

@@ -98,8 +98,7 @@ def log_likelihood_bound(
     found = []
     for some in v.split(10_000, dim=-2):
         h = mean_field(model, some, max_iterations=max_iterations, tolerance=tolerance).h
-        entropy = -(torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
-        found.append(entropy - model.energy(some, h))
+        found.append(-model.free_energy_of_means(some, h))
     return torch.cat(found, dim=-1) - log_z.double().unsqueeze(-1)
 
 

@@ -10,6 +10,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import (
     log_hidden_sum,
+    log_likelihood_bound,
     log_partition_function_by_classes,
 )
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
@@ -17,6 +18,9 @@ from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
 from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
+
+MOST_HIDDEN = 16
+"""Hidden units of a Boltzmann machine that are enumerated for each image at most."""
 
 _NUMBERS = 2**23
 """float64 numbers held at a time."""
@@ -122,7 +126,7 @@ def log_likelihood(
     """
     v = _binary(model, v)
     if isinstance(model, BoltzmannMachine):
-        return log_hidden_sum(model, v, max_units=16) - log_z.double().unsqueeze(-1)
+        return log_hidden_sum(model, v, max_units=MOST_HIDDEN) - log_z.double().unsqueeze(-1)
     weight, b, c = _double(model)
 
     def minus_free_energy(rows: Tensor) -> Tensor:
@@ -130,6 +134,15 @@ def log_likelihood(
         return softplus(field).sum(-1) + (rows @ b.unsqueeze(-1)).squeeze(-1)
 
     return _in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
+
+
+def log_likelihood_or_bound(
+    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
+) -> Float[Tensor, "*replicas n"]:
+    """:func:`log_likelihood`, or :func:`log_likelihood_bound` of a machine with more than 16 hidden units."""
+    if isinstance(model, BoltzmannMachine) and model.n_hidden > MOST_HIDDEN:
+        return log_likelihood_bound(model, v, log_z)
+    return log_likelihood(model, v, log_z)
 
 
 @torch.no_grad()

@@ -268,7 +268,12 @@ class BoltzmannMachine(nn.Module):
 
         It is F(v) if no two hidden units are coupled, and above it otherwise.
         """
-        h = self.hidden_mean(v)
+        return self.free_energy_of_means(v, self.hidden_mean(v))
+
+    def free_energy_of_means(
+        self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
+    ) -> Float[Tensor, "*replicas n"]:
+        r"""``E(v, m) - \sum_i H(m_i)`` of given means m of the hidden units: an upper bound of F(v)."""
         negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
         return self.energy(v, h) + negative_entropy
 
