@@ -1,5 +1,6 @@
 """Estimates of log Z by annealed importance sampling, up from an RBM without couplings and back down."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -224,8 +225,7 @@ def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
 
 def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
     """Log of Z_0 = 2^n_hidden prod_j (1 + exp(b_0j)), ``(*replicas,)`` float64."""
-    log_two = torch.log(torch.tensor(2.0, dtype=torch.float64, device=base.device))
-    return model.n_hidden * log_two + F.softplus(base.double(), threshold=40.0).sum(-1)
+    return model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
 
 
 def _two_layers(model: RBM | BoltzmannMachine, base: Tensor) -> tuple[RBM, Tensor]:

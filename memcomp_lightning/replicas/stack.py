@@ -32,9 +32,12 @@ def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     shapes = [{name: tuple(x.shape) for name, x in state.items()} for state in states]
     require(all(shape == shapes[0] for shape in shapes), "networks", shapes, "networks of one shape")
     # Buffers that are no state are indices, the same in all replicas.
-    tensors = {**dict(whole.named_parameters()), **dict(whole.named_buffers())}
-    for name in states[0]:
-        tensor = tensors[name]
+    parameters = dict(whole.named_parameters())
+    for name, tensor in states[0].items():
         own_axes = tensor.shape[len(replicas) :]
-        tensor.data = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
+        together = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
+        owner, _, own_name = name.rpartition(".")
+        if name in parameters:
+            together = nn.Parameter(together, requires_grad=parameters[name].requires_grad)
+        setattr(whole.get_submodule(owner), own_name, together)
     return whole

@@ -1,9 +1,12 @@
-"""The same numbers on a CUDA device, where there is one."""
+"""The same numbers on another device, and no update for which the host waits."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import lightning.pytorch as pl
 import pytest
+import stand_in
 import torch
 
 from memcomp_lightning import rng
@@ -28,26 +31,21 @@ from memcomp_lightning.replicas import Rates, finetune, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, MeanField, Quench, positive_phase
 from memcomp_lightning.testing import small_dbm, small_machine, small_rbm
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
-
 
 @pytest.mark.parametrize(
     "sampler",
     [CD(k=3), PCD(k=2, n_chains=11), Exact(), Quench(n_chains=11), GroundState(solver=BruteForce())],
     ids=lambda sampler: type(sampler).__name__,
 )
-def test_samplers_draw_the_same_on_both_devices(sampler) -> None:
+def test_samplers_draw_the_same_on_both_devices(sampler, device: str) -> None:
     answers = []
-    for device in ("cpu", "cuda"):
-        rbm = small_rbm(replicas=(3,)).double().to(device)
+    for name in ("cpu", device):
+        rbm = small_rbm(replicas=(3,)).double().to(name)
         v = rng.uniform((3, 11, 7), generator=rng.stream(1, "data"), like=rbm.b)
         generator = rng.stream(2, "negative_phase")
         state = sampler.init(rbm, 11, generator=generator)
         configurations = sampler.sample(rbm, state, positive_phase(rbm, v), generator=generator).configurations
-        assert configurations.v.device.type == device
+        assert configurations.v.device.type == name
         answers.append([part.cpu() for part in configurations if part is not None])
     for cpu, cuda in zip(*answers, strict=True):
         torch.testing.assert_close(cuda, cpu)
@@ -63,38 +61,52 @@ def test_samplers_draw_the_same_on_both_devices(sampler) -> None:
     ],
     ids=["descent", "records", "warm restarts", "bonds"],
 )
-def test_solvers_find_the_optimum_on_the_device(solver) -> None:
+def test_solvers_find_the_optimum_on_the_device(solver, device: str) -> None:
     matrix = torch.empty(2, 7, 7).normal_(generator=rng.stream(3, "matrix"))
-    for qubo in (from_model(small_rbm(replicas=(3,)).cuda()), Qubo.from_matrix(matrix.cuda())):
+    for qubo in (from_model(small_rbm(replicas=(3,)).to(device)), Qubo.from_matrix(matrix.to(device))):
         exact = BruteForce().minimise(qubo, generator=rng.stream(0, "unused")).best_energy
         solution = solver.minimise(qubo, generator=rng.stream(4, "solver"))
-        assert solution.best.device.type == "cuda"
+        assert solution.best.device.type == device
         torch.testing.assert_close(solution.best_energy, exact, rtol=1e-6, atol=1e-9)
 
 
-def test_clauses_of_any_length_are_solved_on_the_device() -> None:
+@pytest.mark.parametrize("n_steps", [200, 800])
+def test_the_host_runs_ahead_of_the_solver(n_steps: int, device: str) -> None:
+    """Steps are never waited for: a quench is, once, and each eighth time whether all restarts are done."""
+    if device != stand_in.NAME:
+        pytest.skip("CUDA does not count for what the host waits")
+    qubo = from_model(small_rbm(replicas=(3,)).to(device))
+    solver = DmmSolver(n_restarts=5, max_steps=n_steps, quench_every=10, stall=None)
+    solver.minimise(qubo, generator=rng.stream(4, "solver"))
+    assert n_steps / 10 <= len(stand_in.waits) <= 1.1 * n_steps / 10 + 20
+
+
+def test_clauses_of_any_length_are_solved_on_the_device(device: str) -> None:
     cpu = WeightedMaxSat.from_clauses(
         7,
         [[1, 2, 3], [-1, 4, -5], [2, -3, 6, 7], [-2, -4], [5, -6], [-7], [3, 5]],
         [1.0, 2.0, 1.5, 0.7, 0.4, 0.3, 1.0],
     )
-    parts = {name: getattr(cpu, name).cuda() for name in ("weight", "first", "second", "unit", "offset")}
+    parts = {name: getattr(cpu, name).to(device) for name in ("weight", "first", "second", "unit", "offset")}
     longer = tuple(
-        Clauses(block.variables.cuda(), block.polarity.cuda(), block.weight.cuda()) for block in cpu.longer
+        Clauses(block.variables.to(device), block.polarity.to(device), block.weight.to(device))
+        for block in cpu.longer
     )
-    problem = WeightedMaxSat(EdgeList(n=7, pairs=cpu.graph.pairs.cuda()), **parts, longer=longer)
+    problem = WeightedMaxSat(EdgeList(n=7, pairs=cpu.graph.pairs.to(device)), **parts, longer=longer)
     solution = DmmSolver(max_steps=101).minimise(problem, generator=rng.stream(4, "solver"))
     exact = cpu.energy(binary_states(7, like=cpu.unit)).min()
     torch.testing.assert_close(solution.best_energy.cpu(), exact)
 
 
-def test_training_runs_on_the_device() -> None:
+def test_training_runs_on_the_device(device: str) -> None:
+    if device == stand_in.NAME:
+        pytest.skip("Lightning knows no accelerator of this name")
     data = ImageDataModule(Digits().load(), batch_size=100, partitions=2)
     dbn = DBN(32, [7, 5], replicas=(2,))
     for module in (DBNPretraining(dbn, PCD(n_chains=11), iterations=2), DBNClassifier(dbn, iterations=2)):
         trainer = pl.Trainer(
             max_epochs=module.n_epochs,
-            accelerator="cuda",
+            accelerator=device,
             devices=1,
             logger=False,
             enable_checkpointing=False,
@@ -104,40 +116,52 @@ def test_training_runs_on_the_device() -> None:
     assert evaluate(module.network, data.test_dataloader()).accuracy.shape == (2,)
 
 
-def test_likelihoods_are_the_same_on_both_devices() -> None:
+def test_likelihoods_are_the_same_on_both_devices(device: str) -> None:
     answers = []
-    for device in ("cpu", "cuda"):
-        rbm = small_rbm(11, 13, replicas=(3,)).double().to(device)
+    for name in ("cpu", device):
+        rbm = small_rbm(11, 13, replicas=(3,)).double().to(name)
         generator = rng.stream(2, "annealing")
         v = exact_samples(rbm, 31, generator=generator)
         up = Ais(n_chains=31, n_betas=53).estimate(rbm, generator=generator, base=base_of(v))
         down = ReverseAis(n_betas=53).estimate(rbm, v, generator=generator)
         exact = (log_partition_function(rbm), kl_divergence(rbm, v), log_pseudo_likelihood(rbm, v))
-        assert all(part.device.type == device for part in (v, *up, *down, *exact))
+        assert all(part.device.type == name for part in (v, *up, *down, *exact))
         answers.append([part.cpu() for part in (v, *up, *down, *exact)])
     for cpu, cuda in zip(*answers, strict=True):
         torch.testing.assert_close(cuda, cpu)
 
 
+@contextmanager
+def _no_waiting(device: str) -> Iterator[None]:
+    """Every synchronisation of host and device is an error."""
+    if device == stand_in.NAME:
+        before = list(stand_in.waits)
+        yield
+        assert stand_in.waits == before
+        return
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
 @pytest.mark.parametrize("sampler", [CD(k=2), PCD(n_chains=11)], ids=["CD", "PCD"])
-def test_the_host_waits_for_no_update(sampler, monkeypatch) -> None:
-    """A pass of many updates, with every synchronisation an error; its order, copied once a pass, lies ready."""
+def test_the_host_waits_for_no_update(sampler, monkeypatch, device: str) -> None:
+    """A pass of many updates; its order, copied once a pass, lies ready."""
     data = ImageDataModule(Digits().load(), batch_size=100, partitions=2)
-    dbn = DBN(32, [7, 5], replicas=(2,)).cuda()
-    network = DBNClassifier(dbn).network.cuda()
-    batches = data.train_batches(0, 1).to("cuda")
+    dbn = DBN(32, [7, 5], replicas=(2,)).to(device)
+    network = DBNClassifier(dbn).network.to(device)
+    batches = data.train_batches(0, 1).to(device)
     order = batches._order()
     monkeypatch.setattr(batches, "_order", lambda: order)
     rates = Rates(partial(torch.optim.SGD, lr=0.1))
-    generator = rng.stream(0, "negative_phase", device="cuda")
+    generator = rng.stream(0, "negative_phase", device=device)
     passes = pretrain_layer(dbn, 0, batches, sampler, iterations=2, rates=rates, generator=generator)
     for training in (passes, finetune(network, batches, iterations=2, rates=rates)):
         next(training)  # kernels are loaded
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with _no_waiting(device):
             next(training)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("make", [small_dbm, small_machine])
@@ -146,10 +170,10 @@ def test_the_host_waits_for_no_update(sampler, monkeypatch) -> None:
     [CD(k=3), PCD(k=2, n_chains=11), Exact(), GroundState(solver=BruteForce())],
     ids=lambda sampler: type(sampler).__name__,
 )
-def test_machines_of_any_connectivity_draw_the_same_on_both_devices(sampler, make) -> None:
+def test_machines_of_any_connectivity_draw_the_same_on_both_devices(sampler, make, device: str) -> None:
     answers = []
-    for device in ("cpu", "cuda"):
-        model = make(replicas=(3,)).double().to(device)
+    for name in ("cpu", device):
+        model = make(replicas=(3,)).double().to(name)
         v = rng.uniform((3, 11, model.n_visible), generator=rng.stream(1, "data"), like=model.b)
         generator = rng.stream(2, "negative_phase")
         positive = MeanField().sample(model, v, generator=generator).configurations
@@ -157,7 +181,7 @@ def test_machines_of_any_connectivity_draw_the_same_on_both_devices(sampler, mak
         negative = sampler.sample(model, state, positive, generator=generator).configurations
         loss = contrast(model, positive, negative)
         parts = (*positive, *negative, loss.detach(), log_partition_function(model))
-        assert all(part is None or part.device.type == device for part in parts)
+        assert all(part is None or part.device.type == name for part in parts)
         answers.append([part.cpu() for part in parts if part is not None])
     for cpu, cuda in zip(*answers, strict=True):
         torch.testing.assert_close(cuda, cpu)
