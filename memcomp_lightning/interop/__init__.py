@@ -6,7 +6,7 @@ from memcomp_lightning.interop.annealer_graph import annealer_graph
 
 _OF_DIMOD = ("AnnealerSamples", "DimodSolver", "from_bqm", "maximum_pseudo_likelihood_beta", "to_bqm")
 
-__all__ = [*_OF_DIMOD, "DmmDimodSampler", "annealer_graph"]
+__all__ = [*_OF_DIMOD, "DmmDimodSampler", "QpuSampler", "annealer_graph"]
 
 
 def __getattr__(name: str) -> Any:
@@ -19,4 +19,8 @@ def __getattr__(name: str) -> Any:
         from memcomp_lightning.interop.dmm_sampler import DmmDimodSampler
 
         return DmmDimodSampler
+    if name == "QpuSampler":
+        from memcomp_lightning.interop.qpu import QpuSampler
+
+        return QpuSampler
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -24,6 +24,10 @@ except ModuleNotFoundError as error:
     ) from error
 
 
+SMALLEST_BETA = 0.01
+"""Estimates stay above: what is asked of a stubborn annealer is finite."""
+
+
 def to_bqm(qubo: Qubo) -> BinaryQuadraticModel:
     """One problem as a binary quadratic model with the variables 0 to n - 1; 20 ms for 784 x 500.
 
@@ -56,12 +60,16 @@ def from_bqm(bqm: BinaryQuadraticModel) -> tuple[Qubo, list[Any]]:
     return Qubo.from_coo(len(units), first, second, numbers, torch.tensor(float(offset)).double()), variables
 
 
-def _reads(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: Generator) -> Tensor:
-    """Assignments of one problem, a row a read, ``(n_reads, n)``."""
+def _answer(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: Generator) -> Any:
+    """The sample set of one problem."""
     given = dict(parameters)
     if "seed" in sampler.parameters and "seed" not in given:
         given["seed"] = int(torch.randint(2**31, (), generator=generator, device=generator.device))
-    answer = sampler.sample(to_bqm(qubo), **given)
+    return sampler.sample(to_bqm(qubo), **given)
+
+
+def _reads(answer: Any, qubo: Qubo) -> Tensor:
+    """Assignments of one problem, a row a read, ``(n_reads, n)``."""
     record, order = answer.record, torch.as_tensor([int(variable) for variable in answer.variables])
     rows = torch.as_tensor(record.sample.astype("float32")).repeat_interleave(
         torch.as_tensor(record.num_occurrences.astype("int64")), dim=0
@@ -92,7 +100,7 @@ class DimodSolver:
         """Return every read of every problem; where one has fewer reads, the rest is marked as not run."""
         begin = time.perf_counter()
         flat = [_problem(qubo, index) for index in range(max(1, qubo.offset.numel()))]
-        reads = [_reads(self.sampler, one, self.parameters, generator) for one in flat]
+        reads = [_reads(_answer(self.sampler, one, self.parameters, generator), one) for one in flat]
         n_reads = max(len(x) for x in reads)
         x = torch.stack([torch.cat((x, x[:1].expand(n_reads - len(x), -1))) for x in reads])
         x = x.view(*qubo.problems, n_reads, qubo.n)
@@ -158,15 +166,20 @@ class AnnealerSamples:
         scale = (1 / state.beta).reshape(*state.beta.shape, *[1] * len(qubo.graph.edge_shape))
         given = Qubo(qubo.graph, qubo.coupling * scale, qubo.linear / state.beta.unsqueeze(-1), qubo.offset)
         problems = [_problem(given, index) for index in range(max(1, given.offset.numel()))]
-        reads = [_reads(self.sampler, one, self.parameters, generator) for one in problems]
+        answers = [_answer(self.sampler, one, self.parameters, generator) for one in problems]
+        reads = [_reads(answer, one) for answer, one in zip(answers, problems, strict=True)]
         n_reads = min(len(x) for x in reads)
         x = torch.stack([x[:n_reads] for x in reads]).view(*model.replicas, n_reads, qubo.n)
         beta = state.beta.clone()
         if self.beta == "estimate":
             found = maximum_pseudo_likelihood_beta(given.field(x), x)
-            beta = beta.lerp(found.to(beta), self.rate)
+            beta = beta.lerp(found.to(beta), self.rate).clamp(min=SMALLEST_BETA)
+        info = {"beta_effective": beta.clone()}
+        if all("chain_break_fraction" in answer.record.dtype.names for answer in answers):
+            broken = [float(answer.record.chain_break_fraction.mean()) for answer in answers]
+            info["chain_break_fraction"] = torch.tensor(broken).to(beta).view(model.replicas)
         v, h = x[..., : model.n_visible], x[..., model.n_visible :]
-        return NegativePhase(Configurations(v, h), AnnealerState(beta), {"beta_effective": beta.clone()})
+        return NegativePhase(Configurations(v, h), AnnealerState(beta), info)
 
 
 def maximum_pseudo_likelihood_beta(

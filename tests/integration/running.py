@@ -8,6 +8,12 @@ from pathlib import Path
 
 FAST = ["pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"]
 
+# D-Wave's own mock of a Pegasus annealer, with a few qubits missing, in place of the service.
+MOCK_QPU = (
+    "sampler.sampler.qpu={_target_:dwave.system.testing.MockDWaveSampler,topology_type:pegasus,topology_shape:[6],"
+    "broken_nodes:[33,108,402],parameter_warnings:false,exact_solver_cutoff:0}"
+)
+
 
 @dataclass(frozen=True)
 class Outcome:

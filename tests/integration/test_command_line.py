@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from running import FAST, Outcome
+from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.cli.build import build
@@ -22,7 +22,8 @@ def options(group: str) -> list[str]:
 
 @pytest.mark.parametrize("sampler", [name for name in options("sampler") if name != "exact"])
 def test_every_sampler_trains(memcomp_train: Run, sampler: str) -> None:
-    outcome = memcomp_train(f"sampler={sampler}", *FAST, "solver.n_restarts=3", "hydra.run.dir=run")
+    qpu = [MOCK_QPU] if sampler == "dwave_qpu" else []
+    outcome = memcomp_train(f"sampler={sampler}", *qpu, *FAST, "solver.n_restarts=3", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     assert "pretrain layer 2" in outcome.out
     assert "tensorboard --logdir 'run'" in outcome.out
@@ -52,7 +53,7 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
 
 
 MANY_RUNS = (
-    *("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "joint"),
+    *("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "joint", "annealer"),
     *("sampler_worth", "joint_likelihood"),
 )
 """Experiments with tests of their own."""
@@ -86,7 +87,7 @@ def test_baseline_and_partitions_report_mean_and_error(memcomp_train: Run) -> No
 def test_help_names_groups_and_examples(memcomp_train: Run) -> None:
     outcome = memcomp_train("--help")
     assert outcome.status == 0
-    assert "sampler: annealer, cd, dmm_qubo" in outcome.out
+    assert "sampler: annealer, cd, dmm_qubo, dmm_time_average, dwave_qpu" in outcome.out
     assert "resume=RUN_FOLDER" in outcome.out
 
 

@@ -40,7 +40,7 @@ def only(found: Records, curve: str, iterations: int) -> Any:
     return record
 
 
-SAMPLERS = [name for name in options("sampler") if name not in ("exact", "ground_state")]
+SAMPLERS = [name for name in options("sampler") if name not in ("exact", "ground_state", "dwave_qpu")]
 
 
 def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
@@ -272,6 +272,16 @@ def test_other_readings_of_the_paper_in_one_table(memcomp_train: Run) -> None:
     assert Path("run/readings_controls.png").stat().st_size > 0
     losses = {record.curve: record.scores["test_loss"][1][0] for record in records().all}
     assert len(set(losses.values())) == len(losses) == 17  # every setting does something
+
+
+def test_an_annealer_in_the_place_of_the_dmm(memcomp_train: Run) -> None:
+    reads = ["sampler.parameters.num_reads=5", "sampler.parameters.num_sweeps=5"]
+    curve = f"figure.curves.annealer.overrides={['sampler=annealer', *reads]}"
+    outcome = memcomp_train("experiment=annealer", *TINY, "figure.iterations=[2]", "figure.controls_at=[2]", curve)
+    assert outcome.status == 0, outcome.err
+    assert "annealer (simulated annealing, 100 reads) is above CD-1 at N = 2" in outcome.out
+    losses = {record.curve: record.scores["test_loss"][1][0] for record in records().all}
+    assert len(set(losses.values())) == len(losses) == 7
 
 
 def test_report_of_existing_folders(memcomp_train: Run, capfd: pytest.CaptureFixture[str]) -> None:
