@@ -3,13 +3,19 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: train test lint
+.PHONY: train test lint notebooks
 
 train: $(VENV)/.installed
 	$(BIN)/memcomp-train data=digits sampler=dmm_qubo
 
 test: $(VENV)/.installed-dev lint
 	$(BIN)/pytest
+
+# Opens the text notebooks in Jupyter; what is changed there goes back into the text.
+notebooks: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[notebooks]'
+	$(BIN)/jupytext --to ipynb --update notebooks/*.py
+	$(BIN)/jupyter lab notebooks
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
