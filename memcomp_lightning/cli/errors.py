@@ -5,7 +5,7 @@ import sys
 from collections.abc import Collection
 from typing import NoReturn
 
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -46,6 +46,11 @@ def explain(error: BaseException) -> str:
             cause = cause.__cause__
         text = str(cause) if cause is not None else str(error).splitlines()[0]
         return f"{setting}: {text}" if setting else text
+    if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.rpartition("/")
+        close = difflib.get_close_matches(option, error.options, n=1)
+        hint = f" Did you mean {group}={close[0]}?" if close else ""
+        return f"{group} = {option!r} does not exist.{hint} Known here: {', '.join(error.options)}."
     if isinstance(error, HydraException):
         text, _, _ = str(error).partition("\nConfig search path:")
         reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from torch.utils.tensorboard import SummaryWriter
 
 from memcomp_lightning.cli.errors import UserError, refuse
+from memcomp_lightning.cli.event_files import event_file
 from memcomp_lightning.cli.table import aligned, short_path
 from memcomp_lightning.cli.worth_report import write_worth
 from memcomp_lightning.errors import SettingError
@@ -72,9 +72,9 @@ def save(folder: Path, name: str, figure: Figure) -> bytes:
         figure.savefig(buffer, format=suffix, dpi=130)
         with written_whole(folder / f"{name}.{suffix}") as path:
             path.write_bytes(buffer.getvalue())
-    writer = SummaryWriter(str(folder))
-    writer.add_figure(name, figure, close=False)
-    writer.close()
+    with event_file(folder) as writer:
+        if writer is not None:
+            writer.add_figure(name, figure, close=False)
     return buffer.getvalue()
 
 

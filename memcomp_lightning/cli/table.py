@@ -54,9 +54,12 @@ def run_table(result: dict[str, Any]) -> str:
 
 def closing_lines(folder: Path) -> str:
     """Where the run is and how to look at it; the command works in a virtual environment that is not active."""
+    place = f"\nRun folder:   {folder}"
+    if not any(folder.rglob("events.out.tfevents.*")):
+        return place
     beside_python = Path(sys.executable).parent / "tensorboard"
     command = "tensorboard" if shutil.which("tensorboard") else short_path(beside_python)
-    return f"\nRun folder:   {folder}\nTensorBoard:  {command} --logdir '{folder}'"
+    return f"{place}\nTensorBoard:  {command} --logdir '{folder}'"
 
 
 def short_path(path: Path) -> Path:

@@ -6,6 +6,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import hydra
@@ -58,6 +59,12 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
             check = trajectory.prepare if "curves" not in part.figure else figures.check
             check(part, own)
         return
+    for name, logger in config.logger.items():
+        writes_events = logger is not None and str(logger.get("_target_")).endswith("TensorBoardLogger")
+        if writes_events and find_spec("tensorboard") is None:
+            raise UserError(
+                f"logger.{name}: TensorBoard is not installed: pip install tensorboard, or logger=csv."
+            )
     values = tried_values(config)
     n_passes = config.finetune.iterations
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")

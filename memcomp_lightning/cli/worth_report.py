@@ -4,17 +4,19 @@ import csv
 import io
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
+from memcomp_lightning.cli.event_files import event_file
 from memcomp_lightning.files import write_text
 from memcomp_lightning.plotting import plot_worth
 from memcomp_lightning.report import Verdict, markdown
 from memcomp_lightning.report.worth import Worth, worth_table, worth_verdicts
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 NUMBERS = "sampler_worth.csv"
 MEASURED = {
@@ -58,13 +60,17 @@ def _write_events(worth: Worth, folder: Path) -> None:
     for method, settings in worth.plan["methods"].items():
         found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
         if found:
-            with SummaryWriter(str(folder / settings["label"])) as writer:
-                _write_method(worth, method, found, writer)
-    with SummaryWriter(str(folder)) as writer:
-        writer.add_custom_scalars(charts)
+            with event_file(folder / settings["label"]) as writer:
+                if writer is not None:
+                    _write_method(worth, method, found, writer)
+    with event_file(folder) as writer:
+        if writer is not None:
+            writer.add_custom_scalars(charts)
 
 
-def _write_method(worth: Worth, method: str, data_sets: list[str], writer: SummaryWriter) -> None:
+def _write_method(worth: Worth, method: str, data_sets: list[str], writer: "SummaryWriter") -> None:
+    from torch.utils.tensorboard.summary import hparams
+
     settings, final = {"method": worth.plan["methods"][method]["label"]}, {}
     for data_set in data_sets:
         course, measure = worth.best(data_set, method), worth.plan["data_sets"][data_set]["measure"]
