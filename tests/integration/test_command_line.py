@@ -95,7 +95,7 @@ REFUSED = {
     "pretrain.iteration=3": ["pretrain.iteration=3", "does not exist", "Did you mean pretrain.iterations?"],
     "sead=3": ["sead=3", "Did you mean seed?"],
     "foo": ["foo is no setting", "NAME=VALUE"],
-    "sampler=foo": ["sampler/foo", "cd dmm_qubo"],
+    "sampler=foo": ["sampler = 'foo'", "cd, dmm_qubo"],
     "pretrain.iterations=-1": ["pretrain.iterations = -1", "an integer >= 0"],
     "pretrain.iterations=abc": ["pretrain.iterations = 'abc'", "an integer >= 0"],
     "finetune.iterations=1.5": ["finetune.iterations = 1.5", "an integer >= 0"],

@@ -47,7 +47,7 @@ def test_without_tensorboard_the_error_says_what_to_install_or_choose(tmp_path: 
     refused = train(tmp_path, "sampler=cd", *FAST, without=absent)
     assert refused.status == 2
     assert (
-        "logger.tensorboard: TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
+        "TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
     )
     assert "Traceback" not in refused.err
     trained = train(tmp_path, "sampler=cd", "logger=csv", *FAST, "hydra.run.dir=run", without=absent)
