@@ -46,9 +46,7 @@ def test_without_tensorboard_the_error_says_what_to_install_or_choose(tmp_path: 
     absent = ("tensorboard", "tensorboardX")
     refused = train(tmp_path, "sampler=cd", *FAST, without=absent)
     assert refused.status == 2
-    assert (
-        "TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
-    )
+    assert "TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
     assert "Traceback" not in refused.err
     trained = train(tmp_path, "sampler=cd", "logger=csv", *FAST, "hydra.run.dir=run", without=absent)
     assert trained.status == 0, trained.err
