@@ -24,10 +24,10 @@ class Outcome:
     err: str
 
 
-def launch(*arguments: str, folder: Path) -> "subprocess.Popen[str]":
-    """Start ``memcomp-train`` as a process of its own; one thread, on which the last bits depend."""
+def launch(*arguments: str, folder: Path, command: str = "train") -> "subprocess.Popen[str]":
+    """Start a command as a process of its own; one thread, on which the last bits depend."""
     return subprocess.Popen(
-        [sys.executable, "-m", "memcomp_lightning.cli.train", *arguments],
+        [sys.executable, "-m", f"memcomp_lightning.cli.{command}", *arguments],
         cwd=folder,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,

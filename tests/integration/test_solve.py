@@ -1,10 +1,7 @@
 """``memcomp-solve``: files in, a table, a solution and a picture out; one line where something is wrong."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from running import Outcome
+from running import Outcome, launch
 
 import memcomp_lightning
 from memcomp_lightning.qubo import read_problem
@@ -190,20 +187,8 @@ def test_help_has_examples_every_format_and_every_solver(memcomp_solve: Solve) -
 
 
 def test_as_a_process_with_ctrl_c(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "memcomp_lightning.cli.solve",
-            "problem=ring.txt",
-            "solver=dmm",
-            "solver.max_steps=10000000",
-        ],
-        cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+    process = launch(
+        "problem=ring.txt", "solver=dmm", "solver.max_steps=10000000", folder=tmp_path, command="solve"
     )
     assert process.stdout is not None
     assert process.stdout.readline().startswith("ring: 5 variables, 5 couplings")
