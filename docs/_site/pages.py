@@ -15,12 +15,11 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[2]
 PACKAGE = "memcomp_lightning"
 
-# Modules beside the subpackages, and what the commands are made of, which nobody imports.
-TOP_LEVEL = ("estimators", "objective", "types", "rng", "errors", "metrics", "files")
+# What the commands are made of, which nobody imports.
 INTERNAL = ("cli", "conf")
 
-# Results in the order of the README.
-RESULTS = {
+# Titles of results, in the order of the README; other experiments follow under their own headings.
+TITLES = {
     "figure2": "Figure 2",
     "figure4": "Figure 4",
     "figure5": "Figure 5",
@@ -33,6 +32,7 @@ RESULTS = {
     "dmm_study": "Parts of the DMM",
     "throughput": "Throughput",
 }
+MADE_BY_RUNS = {"results", "cache"}
 SHOWN = (".md", ".png", ".svg", ".csv", ".json")
 
 # Pages of the repository's top level that others link to.
@@ -72,9 +72,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the generated pages into the navigation."""
     settings = ["config/index.md", *({group: f"config/{slug(group)}.md"} for group in groups())]
     api = ["api/index.md", *({name: f"api/{name}.md"} for name in api_modules())]
-    results = ["experiments/index.md", *({title: f"experiments/{name}/README.md"} for name, title in RESULTS.items())]
+    measured = ["experiments/index.md", *({title: f"experiments/{name}/README.md"} for name, title in results().items())]
     nav = [*(config.nav or [])]
-    nav[2:2] = [{"Configuration": settings}, {"Results": results}]
+    nav[2:2] = [{"Configuration": settings}, {"Results": measured}]
     config.nav = [*nav, {"API": api}, {"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}]
     return config
 
@@ -108,7 +108,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         there = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         return f"]({posixpath.relpath(in_site(there), posixpath.dirname(site) or '.')}{hash_}{anchor})"
 
-    if source != site:
+    if (ROOT / source).exists():
         markdown = re.sub(r"\]\(([^)\s]+)\)", rewritten, markdown)
 
     def inlined(match: re.Match[str]) -> str:
@@ -191,7 +191,7 @@ def settings_page() -> str:
     chosen = defaults()
     rows = [
         f"| [{group}]({slug(group)}.md) | {default_text(group, chosen)} | "
-        f"{len(options(group))} | {GROUP_TEXTS[group]} |"
+        f"{len(options(group))} | {GROUP_TEXTS.get(group, '')} |"
         for group in groups()
     ]
     parts = [
@@ -219,7 +219,7 @@ def default_text(group: str, chosen: dict[str, str | None]) -> str:
 def group_page(group: str) -> str:
     """Return the page of one group."""
     chosen = defaults()
-    parts = [f"# {group}", GROUP_TEXTS[group], f"Default: {default_text(group, chosen)}.", "| option | |\n| --- | --- |"]
+    parts = [f"# {group}", GROUP_TEXTS.get(group, ''), f"Default: {default_text(group, chosen)}.", "| option | |\n| --- | --- |"]
     for item in options(group):
         parts[-1] += f"\n| [`{group}={item.name}`](#{item.name}) | {item.text.replace('|', chr(92) + '|')} |"
     for item in options(group):
@@ -244,8 +244,9 @@ def fenced(text: str) -> str:
 
 def api_modules() -> list[str]:
     """Return subpackages and modules that have a page."""
-    found = sorted(path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py"))
-    return [name for name in found if name not in INTERNAL] + list(TOP_LEVEL)
+    packages = sorted(path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py"))
+    single = sorted(path.stem for path in (ROOT / PACKAGE).glob("*.py") if path.name != "__init__.py")
+    return [name for name in packages if name not in INTERNAL] + single
 
 
 def public_names(module: str) -> list[tuple[str, str]]:
@@ -364,13 +365,20 @@ def indented(*lines: str) -> str:
 # Results
 
 
+def results() -> dict[str, str]:
+    """Return the title of each experiment that has a page."""
+    found = {path.parent.name for path in (ROOT / "experiments").glob("*/README.md")}
+    listed = {name: title for name, title in TITLES.items() if name in found}
+    return listed | {name: heading(name) for name in sorted(found - listed.keys())}
+
+
 def experiment_files() -> list[Path]:
     """Return pages, pictures and tables of the experiments."""
     return sorted(
         path
-        for name in RESULTS
+        for name in results()
         for path in (ROOT / "experiments" / name).rglob("*")
-        if path.suffix in SHOWN and not {"results", "cache"} & set(path.parts)
+        if path.suffix in SHOWN and not MADE_BY_RUNS & set(path.relative_to(ROOT).parts)
     )
 
 
@@ -379,7 +387,7 @@ def results_page() -> str:
     readme = (ROOT / "README.md").read_text()
     shown = readme.partition("## What it shows so far\n")[2].partition("\n## ")[0]
     shown = shown.replace("(experiments/", "(")
-    rows = [f"| [{title}]({name}/README.md) | {heading(name)} |" for name, title in RESULTS.items()]
+    rows = [f"| [{title}]({name}/README.md) | {heading(name)} |" for name, title in results().items()]
     listed = "## All experiments\n\n| | |\n| --- | --- |\n" + "\n".join(rows)
     return f"# Results\n{shown}\n\n{listed}\n"
 
