@@ -14,6 +14,7 @@ FORMULA = re.compile(r"^\.\. math::[ ]*(.*(?:\n[ ]+\S.*)*)", flags=re.MULTILINE)
 
 # What mathtext spells otherwise, or does not know.
 SPELLINGS = {r"\max": r"\mathrm{max}", r"\arg": r"\mathrm{arg\,}", "&": "", r"\qquad": r"\quad", r"\ge ": r"\geq "}
+SPACE = r"\ "
 LEFT_OUT = (
     r"<metadata>.*?</metadata>",
     r"<!--.*?-->",
@@ -72,7 +73,7 @@ def picture(formula: str, size: float) -> str:
     spelled = formula
     for ours, theirs in SPELLINGS.items():
         spelled = spelled.replace(ours, theirs)
-    spelled = re.sub(r"\\text\{([^}]*)\}", lambda match: r"\mathrm{%s}" % match[1].replace(" ", r"\ "), spelled)
+    spelled = re.sub(r"\\text\{([^}]*)\}", lambda match: rf"\mathrm{{{match[1].replace(' ', SPACE)}}}", spelled)
     spelled = WORDS.sub(r"\\mathrm{\1}", spelled)
     stream = io.StringIO()
     with rc_context({"svg.hashsalt": "formula", "mathtext.fontset": "cm", "font.size": size}):

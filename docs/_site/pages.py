@@ -5,7 +5,7 @@ import posixpath
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
@@ -72,7 +72,10 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the generated pages into the navigation."""
     settings = ["config/index.md", *({group: f"config/{slug(group)}.md"} for group in groups())]
     api = ["api/index.md", *({name: f"api/{name}.md"} for name in api_modules())]
-    measured = ["experiments/index.md", *({title: f"experiments/{name}/README.md"} for name, title in results().items())]
+    measured = [
+        "experiments/index.md",
+        *({title: f"experiments/{name}/README.md"} for name, title in results().items()),
+    ]
     nav = [*(config.nav or [])]
     nav[2:2] = [{"Configuration": settings}, {"Results": measured}]
     config.nav = [*nav, {"API": api}, {"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}]
@@ -121,6 +124,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def in_site(source: str) -> str:
     """Return where a file of the repository lies in the site."""
+    top, _, rest = source.partition("/")
+    # Folders, which GitHub shows as they are, stand for the pages made from them.
+    if top == "conf":
+        return f"config/{slug(rest) or 'index'}.md"
+    if top == PACKAGE:
+        return f"api/{rest.partition('/')[0].removesuffix('.py') or 'index'}.md"
+    if source == "experiments":
+        return "experiments/index.md"
     return TOP_PAGES.get(source, source.removeprefix("docs/"))
 
 
@@ -171,7 +182,7 @@ def leading_comment(text: str) -> Iterator[str]:
 
 
 def defaults() -> dict[str, str | None]:
-    """Return the option of each group that ``conf/config.yaml`` names; of nested groups what their parents name."""
+    """Return the option that ``conf/config.yaml`` names for each group; of nested ones what their parents name."""
     chosen: dict[str, str | None] = {}
     for entry in yaml.safe_load((ROOT / "conf/config.yaml").read_text())["defaults"]:
         if isinstance(entry, dict):
@@ -182,7 +193,9 @@ def defaults() -> dict[str, str | None]:
         if parent and parent_option:
             text = (ROOT / "conf" / parent / f"{parent_option}.yaml").read_text()
             entries = (yaml.safe_load(text) or {}).get("defaults", [])
-            chosen[group] = next((entry[name] for entry in entries if isinstance(entry, dict) and name in entry), None)
+            chosen[group] = next(
+                (entry[name] for entry in entries if isinstance(entry, dict) and name in entry), None
+            )
     return chosen
 
 
@@ -213,15 +226,20 @@ def settings_page() -> str:
 
 def default_text(group: str, chosen: dict[str, str | None]) -> str:
     """Return the default of a group, in words where there is none."""
-    return f"`{group}={chosen[group]}`" if chosen.get(group) else "none"
+    return f"`{chosen[group]}`" if chosen.get(group) else "not chosen"
 
 
 def group_page(group: str) -> str:
     """Return the page of one group."""
     chosen = defaults()
-    parts = [f"# {group}", GROUP_TEXTS.get(group, ''), f"Default: {default_text(group, chosen)}.", "| option | |\n| --- | --- |"]
+    parts = [
+        f"# {group}",
+        GROUP_TEXTS.get(group, ""),
+        f"Default: {default_text(group, chosen)}.",
+        "| option | |\n| --- | --- |",
+    ]
     for item in options(group):
-        parts[-1] += f"\n| [`{group}={item.name}`](#{item.name}) | {item.text.replace('|', chr(92) + '|')} |"
+        parts[-1] += f"\n| [`{item.name}`](#{item.name}) | {item.text.replace('|', chr(92) + '|')} |"
     for item in options(group):
         mark = " (default)" if chosen.get(group) == item.name else ""
         parts += [f"## {item.name}{mark} {{#{item.name}}}", item.text]
@@ -231,7 +249,11 @@ def group_page(group: str) -> str:
 
 def class_text(item: Option) -> str:
     """Return a link to the page of the class that an option builds."""
-    return f", which builds [`{item.target.rpartition('.')[2]}`][{item.target}]" if item.target else ""
+    if item.target is None:
+        return ""
+    module, _, name = item.target.removeprefix(f"{PACKAGE}.").partition(".")
+    path = dict(public_names(module)).get(name, item.target)
+    return f", which builds [`{name.rpartition('.')[2]}`][{path}]"
 
 
 def fenced(text: str) -> str:
@@ -276,15 +298,16 @@ def exported(package: Path) -> list[str]:
     """Return ``__all__`` without importing anything; a tuple of names may be unpacked into it."""
     tuples: dict[str, list[str]] = {}
     for node in ast.parse(package.read_text()).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            if isinstance(node.value, ast.Tuple | ast.List):
-                names: list[str] = []
-                for item in node.value.elts:
-                    if isinstance(item, ast.Starred) and isinstance(item.value, ast.Name):
-                        names += tuples[item.value.id]
-                    elif isinstance(item, ast.Constant):
-                        names.append(str(item.value))
-                tuples[node.targets[0].id] = names
+        if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple | ast.List):
+            continue
+        names: list[str] = []
+        for item in node.value.elts:
+            if isinstance(item, ast.Starred) and isinstance(item.value, ast.Name):
+                names += tuples[item.value.id]
+            elif isinstance(item, ast.Constant):
+                names.append(str(item.value))
+        if isinstance(node.targets[0], ast.Name):
+            tuples[node.targets[0].id] = names
     return tuples["__all__"]
 
 
@@ -324,7 +347,9 @@ def dotted(path: Path) -> str:
 def docstring(module: str) -> str:
     """Return what a subpackage or module says about itself."""
     path = ROOT / PACKAGE / module / "__init__.py"
-    return ast.get_docstring(ast.parse((path if path.exists() else path.parent.with_suffix(".py")).read_text())) or ""
+    return (
+        ast.get_docstring(ast.parse((path if path.exists() else path.parent.with_suffix(".py")).read_text())) or ""
+    )
 
 
 def api_index() -> str:
@@ -334,10 +359,10 @@ def api_index() -> str:
         for name in api_modules()
     ]
     text = (
-        "# API\n\nEvery public name, by the subpackage it is imported from. A page begins with what the subpackage "
-        "exports; below stand the public names of its files, for those who build on them. Shapes are those of "
-        "[Concepts](../concepts.md): `*replicas` are leading axes that may be left out. The commands "
-        "are described under [Configuration](../config/index.md).\n\n"
+        "# API\n\nEvery public name, by the subpackage it is imported from. A page begins with what the "
+        "subpackage exports; below stand the public names of its files, for those who build on them. "
+        "Shapes are those of [Concepts](../concepts.md): `*replicas` are leading axes that may be left out. "
+        "The commands are described under [Configuration](../config/index.md).\n\n"
     )
     return text + "| | |\n| --- | --- |\n" + "\n".join(rows) + "\n"
 
