@@ -1,9 +1,10 @@
-# make train: train on the digits that ship with scikit-learn.   make test: everything CI checks.
+# make train: train on the digits that ship with scikit-learn.   make test: everything CI checks.   make docs: the site.
+# make notebooks: Jupyter.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: train test lint notebooks
+.PHONY: train test lint docs notebooks
 
 train: $(VENV)/.installed
 	$(BIN)/memcomp-train data=digits sampler=dmm_qubo
@@ -22,6 +23,10 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Strictly: a broken link or an unknown name ends it. The variable silences an advertisement.
+docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

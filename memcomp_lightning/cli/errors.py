@@ -42,7 +42,7 @@ def explain(error: BaseException) -> str:
     if isinstance(error, InstantiationException):
         setting = _full_key(error)
         cause = error.__cause__
-        while cause is not None and cause.__cause__ is not None:
+        while cause is not None and cause.__cause__ is not None and not _says_what_to_install(cause):
             cause = cause.__cause__
         text = str(cause) if cause is not None else str(error).splitlines()[0]
         return f"{setting}: {text}" if setting else text
@@ -82,6 +82,11 @@ def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str]
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" Did you mean {close[0]}?" if close else ""
     return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
+
+
+def _says_what_to_install(error: BaseException) -> bool:
+    """Whether the package raised this itself in place of Python's own words about a missing module."""
+    return isinstance(error, ModuleNotFoundError) and error.name is None
 
 
 def _full_key(error: InstantiationException) -> str:

@@ -1,6 +1,7 @@
 """What a user types works, and what cannot work is refused before training."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -256,3 +257,12 @@ def test_pretrained_weights_start_another_run(memcomp_train: Run) -> None:
     assert outcome.status == 0, outcome.err
     results = [json.loads(Path(name, "result.json").read_text()) for name in ("first", "second")]
     assert results[0]["test_loss"] == results[1]["test_loss"]
+
+
+def test_a_missing_package_names_the_extra_to_install(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "dimod", None)
+    monkeypatch.delitem(sys.modules, "memcomp_lightning.interop.dimod", raising=False)
+    monkeypatch.delattr("memcomp_lightning.interop.dimod", raising=False)
+    outcome = memcomp_train("sampler=annealer")
+    assert outcome.status == 2
+    assert "pip install 'memcomp-lightning[dimod]'" in outcome.err

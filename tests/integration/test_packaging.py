@@ -61,7 +61,7 @@ def test_wheel_holds_every_config_and_the_type_marker(wheel: Path) -> None:
     assert expected <= names
     assert "memcomp_lightning/conf/__init__.py" in names
     assert "memcomp_lightning/py.typed" in names
-    assert not [name for name in names if name.startswith(("tests", "conf/"))]
+    assert not [name for name in names if name.startswith(("tests", "conf/", "docs", "site", "mkdocs"))]
 
 
 def test_command_line_from_the_wheel(installed: Path, tmp_path: Path) -> None:
