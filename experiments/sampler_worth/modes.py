@@ -1,4 +1,4 @@
-"""Which mode do the solvers find? Their lowest energies above the true one, at the final RBMs of experiment=sampler_worth.
+"""How far above the true mode do solvers end? At the final RBMs of a run of experiment=sampler_worth.
 
 python experiments/sampler_worth/modes.py RUN_FOLDER --data-set mnist_16       # enumerates the hidden layer
 """
