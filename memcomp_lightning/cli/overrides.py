@@ -14,6 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
+from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
 from memcomp_lightning.errors import require
 
 CONFIG_MODULE = "memcomp_lightning.conf"
@@ -36,7 +37,7 @@ def job_folder(overrides: str) -> str:
     return name or "job"
 
 
-OmegaConf.register_new_resolver("memcomp_job_folder", job_folder, replace=True)
+register_resolver("memcomp_job_folder", job_folder, replace=True)
 
 
 def is_multirun(arguments: Sequence[str]) -> bool:
@@ -68,7 +69,7 @@ def check_command_line(
     multirun = is_multirun(arguments)
     overrides = [argument for argument in arguments if not argument.startswith("-")]
     _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
-    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
+    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
         plain = compose(config_name)
         groups = GlobalHydra.instance().config_loader().list_groups("")
         try:

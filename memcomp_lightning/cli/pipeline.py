@@ -7,7 +7,6 @@ from typing import Any, cast
 import lightning.pytorch as pl
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
@@ -16,6 +15,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
+from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN

@@ -19,6 +19,7 @@ from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory, 
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
+from memcomp_lightning.cli.hydra_versions import MAIN
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
@@ -30,7 +31,7 @@ COMMAND = "memcomp-train"
 log = logging.getLogger(__name__)
 
 
-@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", version_base="1.3")
+@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", **MAIN)
 def train(config: DictConfig) -> None:
     """One run, or one job of a sweep."""
     _silence_lightning()  # again: a job of a parallel launcher is in a process of its own

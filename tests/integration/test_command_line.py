@@ -11,6 +11,7 @@ from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.hydra_versions import INITIALIZE
 
 Run = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"
@@ -43,7 +44,7 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
     small = [*FAST, "sampler=mode_assisted_cd", "pretrain.iterations=3"]
     for batch_size, n_updates in (("null", 3), ("500", 9)):
         overrides = [*small, f"pretrain.batch_size={batch_size}"]
-        with initialize_config_module("memcomp_lightning.conf", version_base="1.3"):
+        with initialize_config_module("memcomp_lightning.conf", **INITIALIZE):
             plan = build(compose("config", overrides))
         assert plan.pretraining is not None
         assert plan.pretraining.module.sampler.schedule.n_updates == n_updates  # type: ignore[attr-defined]
