@@ -19,6 +19,7 @@ CONFIGURATION_ERRORS = (
     ValueError,
     TypeError,
     OSError,
+    ImportError,
     HydraException,
     OmegaConfBaseException,
 )
@@ -40,7 +41,7 @@ def refuse(command: str, error: Exception) -> NoReturn:
 def explain(error: BaseException) -> str:
     """Return the message for a configuration error: the innermost cause, and the setting it belongs to."""
     if isinstance(error, InstantiationException):
-        setting = _full_key(error)
+        setting = _full_key(*str(error).splitlines())
         cause = error.__cause__
         while cause is not None and cause.__cause__ is not None:
             cause = cause.__cause__
@@ -49,8 +50,11 @@ def explain(error: BaseException) -> str:
     if isinstance(error, HydraException):
         text, _, _ = str(error).partition("\nConfig search path:")
         reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]
-        return " ".join([*text.split(), reason]).rstrip()
-    return str(error)
+        plugin = any(f"hydra/{group}" in text for group in ("launcher", "sweeper"))
+        remedy = "Plugins of Hydra: pip install 'memcomp-lightning[sweep]'." if plugin else ""
+        return " ".join([*text.split(), reason, remedy]).rstrip()
+    setting = _full_key(*getattr(error, "__notes__", ()))  # Hydra 1.4 does not wrap what a target raises
+    return f"{setting}: {error}" if setting else str(error)
 
 
 def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str] = ()) -> str | None:
@@ -79,9 +83,9 @@ def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str]
     return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
 
 
-def _full_key(error: InstantiationException) -> str:
+def _full_key(*lines: str) -> str:
     """The setting that Hydra was building."""
-    for line in str(error).splitlines():
+    for line in lines:
         if line.startswith("full_key: "):
             return line.removeprefix("full_key: ")
     return ""

@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
 from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
+from memcomp_lightning.cli.search import planned_jobs
 from memcomp_lightning.errors import require
 
 CONFIG_MODULE = "memcomp_lightning.conf"
 
 MULTIRUN_FLAGS = {"-m", "--multirun"}
+
+_SEARCHES = ("hparams=", "hydra/sweeper=")
 
 LONGEST_NAME = 150
 """Characters of a job's folder; file systems allow 255."""
@@ -51,6 +52,7 @@ def check_command_line(
     config_name: str,
     check: Callable[[DictConfig, Sequence[str]], object],
     folders: tuple[str, str],
+    check_searchable: Callable[[DictConfig], object] | None = None,
 ) -> None:
     """Check every job that the arguments stand for, and do none; with other flags, such as --help, nothing.
 
@@ -60,6 +62,7 @@ def check_command_line(
         check: Builds what a job needs, from its configuration and overrides, or raises one of
             ``CONFIGURATION_ERRORS``.
         folders: Where a run and a sweep write, unless the arguments say it.
+        check_searchable: Raises if a job returns nothing that a search could go by; None if none does.
 
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
@@ -73,7 +76,13 @@ def check_command_line(
         plain = compose(config_name)
         groups = GlobalHydra.instance().config_loader().list_groups("")
         try:
-            jobs = _jobs(overrides) if multirun else [list(overrides)]
+            jobs, searches = [list(overrides)], False
+            if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
+                raise UserError("a search is a multirun: add -m.")
+            if multirun:
+                jobs, searches = planned_jobs(overrides, config_name=config_name)
+                if searches and check_searchable is None:
+                    raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
             _raise_first(unknown_setting(o, plain, groups) for o in jobs[0] if "." not in o.partition("=")[0])
             defaults = compose(config_name, [o for o in jobs[0] if _chooses_group(o)])
             _raise_first(unknown_setting(override, defaults, groups) for override in jobs[0])
@@ -81,7 +90,10 @@ def check_command_line(
             raise UserError(explain(error)) from error
         for job in jobs:
             try:
-                check(compose(config_name, job), job)
+                config = compose(config_name, job)
+                if searches and check_searchable is not None:
+                    check_searchable(config)
+                check(config, job)
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
@@ -100,12 +112,6 @@ def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:
             f"{key} = {folder} is not allowed: no file can be written in {existing} ({error.strerror}). Choose "
             f"another folder with {key}=PATH."
         ) from error
-
-
-def _jobs(overrides: Sequence[str]) -> list[list[str]]:
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    return jobs
 
 
 def _chooses_group(override: str) -> bool:

@@ -74,6 +74,9 @@ def run(
         score = evaluate(module.network, plan.finetuning.data.test_dataloader(), module.loss)
         result["test_accuracy"] = _numbers(score.accuracy)
         result["test_loss"] = _numbers(score.mean_loss)
+        if plan.finetuning.data.validation is not None:
+            held_out = evaluate(module.network, plan.finetuning.data.val_dataloader(), module.loss)
+            result["validation_accuracy"] = _numbers(held_out.accuracy)
     if is_global_zero and not config.trainer.fast_dev_run:
         _log_final(loggers, config, result)
         folder.finish(result)

@@ -1,0 +1,68 @@
+"""Multiruns before they start: which jobs there will be, and whether their sweeper can search."""
+
+from collections.abc import Sequence
+
+from hydra import compose
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig
+
+from memcomp_lightning.errors import require
+
+
+def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[list[str]], bool]:
+    """Jobs that a multirun will do, and whether its sweeper searches.
+
+    A search (``hydra/sweeper=optuna``) decides on its jobs by what earlier ones returned. In their place stand
+    those in which one setting after the other takes each of its choices, or the ends of its interval.
+    """
+    parsed = _parsed(overrides)
+    fixed = [override.input_line or "" for override in parsed if not override.is_sweep_override()]
+    sweeper = compose(config_name, fixed, return_hydra_config=True).hydra.sweeper
+    settings = {}
+    for override in [*_parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()]), *parsed]:
+        settings[override.get_key_element()] = override
+    if sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
+        (jobs,) = BasicSweeper.split_arguments(list(settings.values()), None)
+        return jobs, False
+    values = [_values(override) for override in settings.values()]
+    first = [options[0] for options in values]
+    others = [
+        [*first[:position], option, *first[position + 1 :]]
+        for position, options in enumerate(values)
+        for option in options[1:]
+    ]
+    return [first, *others], True
+
+
+def check_searchable(config: DictConfig) -> None:
+    """Refuse a job that returns nothing to search by.
+
+    Raises:
+        SettingError: Naming the setting.
+    """
+    require(config.figure is None and config.worth is None, "experiment", "one of many runs", "one run in a search")
+    require(
+        config.data.validation_fraction > 0,
+        "data.validation_fraction",
+        config.data.validation_fraction,
+        "a share above 0 of the training images in a search",
+        "The test images would choose the settings.",
+    )
+    n_passes = config.finetune.iterations
+    require(n_passes > 0, "finetune.iterations", n_passes, "an integer >= 1 in a search, which goes by accuracy")
+
+
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _values(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if override.is_interval_sweep():
+        interval = override.value()
+        return [f"{key}={end}" for end in (interval.start, interval.end)]  # type: ignore[union-attr]
+    if override.is_sweep_override():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [override.input_line or ""]
