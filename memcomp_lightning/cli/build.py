@@ -80,7 +80,7 @@ _GROUPS = (
     "callbacks",
 )
 _SETTINGS = {
-    "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure", "worth"),
+    "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": (*_STAGE_SETTINGS, "centring", "module"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),

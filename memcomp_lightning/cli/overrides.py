@@ -20,6 +20,7 @@ CONFIG_MODULE = "memcomp_lightning.conf"
 
 MULTIRUN_FLAGS = {"-m", "--multirun"}
 
+_SEARCH_PATH = "hydra.searchpath="
 _SEARCHES = ("hparams=", "hydra/sweeper=")
 
 LONGEST_NAME = 150
@@ -67,15 +68,16 @@ def check_command_line(
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
     """
-    if not {argument for argument in arguments if argument.startswith("-")} <= MULTIRUN_FLAGS:
-        return
     multirun = is_multirun(arguments)
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    overrides = _as_overrides(arguments)
+    if overrides is None:
+        return
     _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
     with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
-        plain = compose(config_name)
+        paths = [override for override in overrides if override.startswith(_SEARCH_PATH)]
         groups = GlobalHydra.instance().config_loader().list_groups("")
         try:
+            plain = compose(config_name, paths)
             jobs, searches = [list(overrides)], False
             if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
                 raise UserError("a search is a multirun: add -m.")
@@ -84,7 +86,7 @@ def check_command_line(
                 if searches and check_searchable is None:
                     raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
             _raise_first(unknown_setting(o, plain, groups) for o in jobs[0] if "." not in o.partition("=")[0])
-            defaults = compose(config_name, [o for o in jobs[0] if _chooses_group(o)])
+            defaults = compose(config_name, [*paths, *(o for o in jobs[0] if _chooses_group(o))])
             _raise_first(unknown_setting(override, defaults, groups) for override in jobs[0])
         except CONFIGURATION_ERRORS as error:
             raise UserError(explain(error)) from error
@@ -97,6 +99,23 @@ def check_command_line(
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
+
+
+def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
+    """The overrides, with a ``--config-dir`` as one of them; None if there are other flags than of multirun."""
+    overrides, flags = [], set()
+    left = iter(arguments)
+    for argument in left:
+        name, equals, value = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            folder = Path(value if equals else next(left, "")).absolute()
+            overrides.append(f"{_SEARCH_PATH}['file://{folder}']")
+        elif argument.startswith("-"):
+            flags.add(argument)
+        else:
+            overrides.append(argument)
+    one_path = sum(override.startswith(_SEARCH_PATH) for override in overrides) <= 1
+    return overrides if flags <= MULTIRUN_FLAGS and one_path else None
 
 
 def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:

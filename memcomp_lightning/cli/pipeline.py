@@ -117,7 +117,7 @@ def make_trainer(
         require(name not in _NOT_WITH_OWN_STEPS, f"trainer.{name}", value, allowed, "Use batch_size.")
     settings = OmegaConf.to_container(config.trainer, resolve=True)
     assert isinstance(settings, dict)
-    require_count("trainer.checkpoint_every", settings.pop("checkpoint_every"))
+    require_count("checkpoint_every", config.checkpoint_every)
     trainer: pl.Trainer = instantiate(
         settings,
         _convert_="all",
@@ -138,7 +138,7 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
     keep_last = ModelCheckpoint(
         dirpath=path.parent,
         filename=path.stem,
-        every_n_epochs=config.trainer.checkpoint_every,
+        every_n_epochs=config.checkpoint_every,
         save_on_train_epoch_end=True,
         enable_version_counter=False,
     )

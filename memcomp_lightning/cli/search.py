@@ -1,6 +1,7 @@
 """Multiruns before they start: which jobs there will be, and whether their sweeper can search."""
 
 from collections.abc import Sequence
+from importlib.metadata import version
 
 from hydra import compose
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -8,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
 
+from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.errors import require
 
 
@@ -20,6 +22,7 @@ def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[li
     parsed = _parsed(overrides)
     fixed = [override.input_line or "" for override in parsed if not override.is_sweep_override()]
     sweeper = compose(config_name, fixed, return_hydra_config=True).hydra.sweeper
+    _check_storage(sweeper.get("storage"))
     settings = {}
     for override in [*_parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()]), *parsed]:
         settings[override.get_key_element()] = override
@@ -52,6 +55,16 @@ def check_searchable(config: DictConfig) -> None:
     )
     n_passes = config.finetune.iterations
     require(n_passes > 0, "finetune.iterations", n_passes, "an integer >= 1 in a search, which goes by accuracy")
+
+
+def _check_storage(storage: object) -> None:
+    """Refuse what would end in an AssertionError inside optuna."""
+    if storage is not None and version("optuna") < "3" and version("sqlalchemy") >= "2":
+        raise UserError(
+            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {version('optuna')} cannot use SQLAlchemy "
+            f"{version('sqlalchemy')}. Leave it null, with hydra.sweep.dir=FOLDER: the same command goes on from the "
+            "jobs in that folder. Or take Hydra 1.4 with hydra-optuna-sweeper 1.4."
+        )
 
 
 def _parsed(overrides: Sequence[str]) -> list[Override]:

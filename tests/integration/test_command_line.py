@@ -111,7 +111,7 @@ REFUSED = {
     "model.weights=none.pt": ["none.pt does not exist"],
     "sampler=exact": ["32 is not allowed", "max_units = 16"],
     "trainer.devices=0": ["devices=0"],
-    "trainer.checkpoint_every=0": ["trainer.checkpoint_every = 0", "an integer >= 1"],
+    "checkpoint_every=0": ["checkpoint_every = 0", "an integer >= 1"],
     "hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
     "callbacks.pretrain.momentum_schedule.initial=2": ["momentum initial = 2", "[0, 1)"],
     "+keep=1": ["setting = 'keep'", "'pretrain'"],
