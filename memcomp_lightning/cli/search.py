@@ -20,8 +20,9 @@ def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[li
     those in which one setting after the other takes each of its choices, or the ends of its interval.
     """
     parsed = _parsed(overrides)
-    fixed = [override.input_line or "" for override in parsed if not override.is_sweep_override()]
-    sweeper = compose(config_name, fixed, return_hydra_config=True).hydra.sweeper
+    # Other settings may need a group that is swept: sampler.k of sampler=cd,pcd.
+    of_sweeper = [o.input_line or "" for o in parsed if o.is_hydra_override() or o.key_or_group == "hparams"]
+    sweeper = compose(config_name, of_sweeper, return_hydra_config=True).hydra.sweeper
     _check_storage(sweeper.get("storage"))
     settings = {}
     for override in [*_parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()]), *parsed]:
@@ -45,7 +46,9 @@ def check_searchable(config: DictConfig) -> None:
     Raises:
         SettingError: Naming the setting.
     """
-    require(config.figure is None and config.worth is None, "experiment", "one of many runs", "one run in a search")
+    require(
+        config.figure is None and config.worth is None, "experiment", "one of many runs", "one run in a search"
+    )
     require(
         config.data.validation_fraction > 0,
         "data.validation_fraction",
@@ -59,11 +62,14 @@ def check_searchable(config: DictConfig) -> None:
 
 def _check_storage(storage: object) -> None:
     """Refuse what would end in an AssertionError inside optuna."""
-    if storage is not None and version("optuna") < "3" and version("sqlalchemy") >= "2":
+    if storage is None:
+        return
+    optuna, sqlalchemy = version("optuna"), version("sqlalchemy")
+    if int(optuna.partition(".")[0]) < 3 and int(sqlalchemy.partition(".")[0]) >= 2:
         raise UserError(
-            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {version('optuna')} cannot use SQLAlchemy "
-            f"{version('sqlalchemy')}. Leave it null, with hydra.sweep.dir=FOLDER: the same command goes on from the "
-            "jobs in that folder. Or take Hydra 1.4 with hydra-optuna-sweeper 1.4."
+            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {optuna} cannot use SQLAlchemy {sqlalchemy}. "
+            "Leave it null: with hydra.sweep.dir=FOLDER the same command goes on from the jobs in that folder. Or "
+            "take Hydra 1.4 with hydra-optuna-sweeper 1.4."
         )
 
 

@@ -158,7 +158,13 @@ def main() -> None:
                 "processes. Give the jobs one by one, or use one device with a parallel launcher."
             )
         if "LOCAL_RANK" not in os.environ:
-            check_command_line(sys.argv[1:], config_name="config", check=_check, folders=("runs", "multirun"), check_searchable=check_searchable)
+            check_command_line(
+                sys.argv[1:],
+                config_name="config",
+                check=_check,
+                folders=("runs", "multirun"),
+                check_searchable=check_searchable,
+            )
         train()
     except UserError as error:
         refuse(COMMAND, error)

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Any, Literal
 
-
 from memcomp_lightning.errors import SettingError, require, require_choice, require_count
 
 try:

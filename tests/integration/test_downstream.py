@@ -90,17 +90,15 @@ def test_its_module_trains_with_our_callbacks(python: Path, tmp_path: Path) -> N
 
 
 def test_its_multirun_takes_its_sampler_and_ours(python: Path, tmp_path: Path) -> None:
-    sweep = ["-m", "sampler=random_scan,cd,dmm_qubo", "max_epochs=1", "solver.max_steps=20"]
+    sweep = ["-m", "sampler=random_scan,cd", "max_epochs=1"]
     out = run(python.parent / "sparse-digits", *sweep, folder=tmp_path)
-    assert re.findall(r"^(\w+): sparsity", out, flags=re.MULTILINE) == ["RandomScan", "CD", "GroundState"]
+    assert re.findall(r"^(\w+): sparsity", out, flags=re.MULTILINE) == ["RandomScan", "CD"]
 
 
 def test_its_sampler_pretrains_our_dbn(python: Path, tmp_path: Path) -> None:
     train = [python.parent / "memcomp-train", "hydra.searchpath=[pkg://sparse_digits.conf]", "sampler=random_scan"]
     run(*train, *FAST, "hydra.run.dir=run", folder=tmp_path)
     assert len(json.loads((tmp_path / "run/result.json").read_text())["stages"]["pretrain"]["energy_gap"]) == 2
-    out = run(*train, "sampler.share=2", folder=tmp_path, status=2)
-    assert out.strip() == "memcomp-train: sampler: share = 2 is not allowed: expected a number in (0, 1]."
 
 
 def test_its_own_tests_pass(python: Path, project: Path) -> None:
@@ -113,34 +111,48 @@ def test_help_of_our_command(python: Path, tmp_path: Path) -> None:
     assert "hparams: pretraining" in out
 
 
-def test_our_types_are_seen(python: Path, project: Path) -> None:
+def test_our_types_are_seen(python: Path, project: Path, tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text("from memcomp_lightning.models import RBM\n\nRBM('three', 2)\n")
     mypy = [sys.executable, "-m", "mypy", "--python-executable", python, "--cache-dir", os.devnull]
-    assert "Success" in run(*mypy, folder=project)
-    (project / "wrong.py").write_text("from memcomp_lightning.models import RBM\n\nRBM('three', 2)\n")
-    assert 'incompatible type "str"; expected "int"' in run(*mypy, project / "wrong.py", folder=project, status=1)
+    out = run(*mypy, "sparse_digits", wrong, folder=project, status=1)
+    assert 'wrong.py:3: error: Argument 1 to "RBM" has incompatible type "str"; expected "int"' in out
+    assert "Found 1 error in 1 file" in out
 
 
 WITHOUT_EXTRAS = {
-    "sampler=annealer": "pip install 'memcomp-lightning[dimod]'",
-    "solver=dimod": "pip install 'memcomp-lightning[dimod]'",
-    "model=zephyr": "pip install 'memcomp-lightning[dimod]'",
-    "-m hydra/launcher=joblib": "pip install 'memcomp-lightning[sweep]'",
-    "-m hydra/launcher=submitit_local": "pip install 'memcomp-lightning[sweep]'",
-    "-m hparams=pretraining": "pip install 'memcomp-lightning[sweep]'",
+    "sampler=annealer": "dimod",
+    "solver=dimod": "dimod",
+    "model=zephyr": "dimod",
+    "-m hydra/launcher=joblib": "sweep",
+    "-m hydra/launcher=submitit_local": "sweep",
+    "-m hparams=pretraining": "sweep",
 }
 
+EACH_IN_TURN = """
+import contextlib, sys
+from hydra.core.global_hydra import GlobalHydra
+from memcomp_lightning.cli import train
 
-@pytest.mark.parametrize("arguments", WITHOUT_EXTRAS)
-def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_path: Path, arguments: str) -> None:
-    out = run(python.parent / "memcomp-train", *arguments.split(), folder=tmp_path, status=2)
-    assert WITHOUT_EXTRAS[arguments] in out
-    assert len(out.splitlines()) == 1, out
+for arguments in sys.argv[1:]:
+    sys.argv[1:] = arguments.split()
+    GlobalHydra.instance().clear()
+    with contextlib.suppress(SystemExit):
+        train.main()
+"""
+
+
+def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_path: Path) -> None:
+    messages = run(python, "-c", EACH_IN_TURN, *WITHOUT_EXTRAS, folder=tmp_path).splitlines()
+    for message, extra in zip(messages, WITHOUT_EXTRAS.values(), strict=True):
+        assert message.startswith("memcomp-train: ")
+        assert message.endswith(f"pip install 'memcomp-lightning[{extra}]'.")
 
 
 def test_imports_without_extras(python: Path, tmp_path: Path) -> None:
-    code = f"""
+    code = """
 import importlib, pkgutil, memcomp_lightning
-needs = {{"memcomp_lightning.interop." + name for name in ("dimod", "dmm_sampler", "qpu")}}
+needs = {"memcomp_lightning.interop." + name for name in ("dimod", "dmm_sampler", "qpu")}
 for module in pkgutil.walk_packages(memcomp_lightning.__path__, "memcomp_lightning."):
     if module.name not in needs:
         importlib.import_module(module.name)
@@ -157,11 +169,9 @@ for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
 
 def test_search_and_launchers_with_hydra_1_4(python_with_plugins: Path, tmp_path: Path) -> None:
     train = [python_with_plugins, "-m", "memcomp_lightning.cli.train", "-m", "callbacks=minimal", *FAST]
+    search = ["hparams=pretraining", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra/launcher=joblib"]
     storage = ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=trials"]
-    search = ["hparams=pretraining", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=search", *storage]
-    run(*train, *search, folder=tmp_path)
+    run(*train, "sampler=cd", *search, *storage, "hydra.sweep.dir=search", folder=tmp_path)
     assert "best_value" in (tmp_path / "search/optimization_results.yaml").read_text()
-    for launcher in ("joblib", "submitit_local"):
-        folder = f"hydra.sweep.dir={launcher}"
-        run(*train, "sampler=cd", f"hydra/launcher={launcher}", folder, folder=tmp_path)
-        assert (tmp_path / launcher / "table.csv").exists()
+    run(*train, "sampler=cd", "hydra/launcher=submitit_local", "hydra.sweep.dir=sweep", folder=tmp_path)
+    assert (tmp_path / "sweep/table.csv").exists()
