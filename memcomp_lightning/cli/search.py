@@ -67,9 +67,9 @@ def _check_storage(storage: object) -> None:
     optuna, sqlalchemy = version("optuna"), version("sqlalchemy")
     if int(optuna.partition(".")[0]) < 3 and int(sqlalchemy.partition(".")[0]) >= 2:
         raise UserError(
-            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {optuna} cannot use SQLAlchemy {sqlalchemy}. "
-            "Leave it null: with hydra.sweep.dir=FOLDER the same command goes on from the jobs in that folder. Or "
-            "take Hydra 1.4 with hydra-optuna-sweeper 1.4."
+            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {optuna} cannot use SQLAlchemy "
+            f"{sqlalchemy}. Leave it null: with hydra.sweep.dir=FOLDER the same command goes on from the jobs in "
+            "that folder. Or take Hydra 1.4 with hydra-optuna-sweeper 1.4."
         )
 
 
