@@ -167,11 +167,9 @@ for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
     assert extras == [("DimodSolver", "dimod"), ("DmmDimodSampler", "dimod"), ("QpuSampler", "dwave")]
 
 
-def test_search_and_launchers_with_hydra_1_4(python_with_plugins: Path, tmp_path: Path) -> None:
+def test_parallel_search_with_hydra_1_4(python_with_plugins: Path, tmp_path: Path) -> None:
     train = [python_with_plugins, "-m", "memcomp_lightning.cli.train", "-m", "callbacks=minimal", *FAST]
     search = ["hparams=pretraining", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra/launcher=joblib"]
     storage = ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=trials"]
     run(*train, "sampler=cd", *search, *storage, "hydra.sweep.dir=search", folder=tmp_path)
     assert "best_value" in (tmp_path / "search/optimization_results.yaml").read_text()
-    run(*train, "sampler=cd", "hydra/launcher=submitit_local", "hydra.sweep.dir=sweep", folder=tmp_path)
-    assert (tmp_path / "sweep/table.csv").exists()
