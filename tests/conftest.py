@@ -36,6 +36,9 @@ with install_import_hook(HOOKED, "memcomp_lightning_tests.check_shapes"):
 
 torch.set_num_threads(1)
 
+# A project of its own, whose tests run where it is installed: integration/test_downstream.py.
+collect_ignore = ["downstream"]
+
 
 def pytest_sessionstart(session):
     """Compile the kernels before there are several workers, each of which would; later runs load them."""

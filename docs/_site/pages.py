@@ -46,6 +46,7 @@ GROUP_TEXTS = {
     "figure": "Curves, sizes and claims of a figure; the experiments of that name choose them.",
     "figure/curves": "Curves that a figure adds to its own.",
     "finetune": "Back-propagation after pretraining.",
+    "hparams": "Searches for good settings, a multirun; [sweeps](../sweeps.md).",
     "logger": "Where numbers and pictures go.",
     "model": "The network.",
     "positive": "What supplies the hidden units given the data where they are coupled to each other.",

@@ -10,13 +10,14 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from hydra.utils import get_class, instantiate
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, MomentumSchedule
 from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count
@@ -79,7 +80,7 @@ _GROUPS = (
     "callbacks",
 )
 _SETTINGS = {
-    "": (*_GROUPS, "seed", "between_stages", "choose", "tried", "figure", "worth"),
+    "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": (*_STAGE_SETTINGS, "centring", "module"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),

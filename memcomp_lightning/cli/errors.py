@@ -19,6 +19,7 @@ CONFIGURATION_ERRORS = (
     ValueError,
     TypeError,
     OSError,
+    ImportError,
     HydraException,
     OmegaConfBaseException,
 )
@@ -40,9 +41,9 @@ def refuse(command: str, error: Exception) -> NoReturn:
 def explain(error: BaseException) -> str:
     """Return the message for a configuration error: the innermost cause, and the setting it belongs to."""
     if isinstance(error, InstantiationException):
-        setting = _full_key(error)
+        setting = _full_key(*str(error).splitlines())
         cause = error.__cause__
-        while cause is not None and cause.__cause__ is not None and not _says_what_to_install(cause):
+        while cause is not None and cause.__cause__ is not None:
             cause = cause.__cause__
         text = str(cause) if cause is not None else str(error).splitlines()[0]
         return f"{setting}: {text}" if setting else text
@@ -50,12 +51,15 @@ def explain(error: BaseException) -> str:
         group, _, option = error.missing_cfg_file.rpartition("/")
         close = difflib.get_close_matches(option, error.options, n=1)
         hint = f" Did you mean {group}={close[0]}?" if close else ""
+        if group in ("hydra/launcher", "hydra/sweeper"):
+            hint += " Plugins of Hydra: pip install 'memcomp-lightning[sweep]'."
         return f"{group} = {option!r} does not exist.{hint} Known here: {', '.join(error.options)}."
     if isinstance(error, HydraException):
         text, _, _ = str(error).partition("\nConfig search path:")
         reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]
         return " ".join([*text.split(), reason]).rstrip()
-    return str(error)
+    setting = _full_key(*getattr(error, "__notes__", ()))  # Hydra 1.4 does not wrap what a target raises
+    return f"{setting}: {error}" if setting else str(error)
 
 
 def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str] = ()) -> str | None:
@@ -84,14 +88,9 @@ def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str]
     return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
 
 
-def _says_what_to_install(error: BaseException) -> bool:
-    """Whether the package raised this itself in place of Python's own words about a missing module."""
-    return isinstance(error, ModuleNotFoundError) and error.name is None
-
-
-def _full_key(error: InstantiationException) -> str:
+def _full_key(*lines: str) -> str:
     """The setting that Hydra was building."""
-    for line in str(error).splitlines():
+    for line in lines:
         if line.startswith("full_key: "):
             return line.removeprefix("full_key: ")
     return ""

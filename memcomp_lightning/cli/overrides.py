@@ -8,17 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
+from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
+from memcomp_lightning.cli.search import planned_jobs
 from memcomp_lightning.errors import require
 
 CONFIG_MODULE = "memcomp_lightning.conf"
 
 MULTIRUN_FLAGS = {"-m", "--multirun"}
+
+_SEARCH_PATH = "hydra.searchpath="
+_SEARCHES = ("hparams=", "hydra/sweeper=")
 
 LONGEST_NAME = 150
 """Characters of a job's folder; file systems allow 255."""
@@ -36,7 +39,7 @@ def job_folder(overrides: str) -> str:
     return name or "job"
 
 
-OmegaConf.register_new_resolver("memcomp_job_folder", job_folder, replace=True)
+register_resolver("memcomp_job_folder", job_folder, replace=True)
 
 
 def is_multirun(arguments: Sequence[str]) -> bool:
@@ -50,6 +53,7 @@ def check_command_line(
     config_name: str,
     check: Callable[[DictConfig, Sequence[str]], object],
     folders: tuple[str, str],
+    check_searchable: Callable[[DictConfig], object] | None = None,
 ) -> None:
     """Check every job that the arguments stand for, and do none; with other flags, such as --help, nothing.
 
@@ -59,31 +63,59 @@ def check_command_line(
         check: Builds what a job needs, from its configuration and overrides, or raises one of
             ``CONFIGURATION_ERRORS``.
         folders: Where a run and a sweep write, unless the arguments say it.
+        check_searchable: Raises if a job returns nothing that a search could go by; None if none does.
 
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
     """
-    if not {argument for argument in arguments if argument.startswith("-")} <= MULTIRUN_FLAGS:
-        return
     multirun = is_multirun(arguments)
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    overrides = _as_overrides(arguments)
+    if overrides is None:
+        return
     _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
-    with initialize_config_module(CONFIG_MODULE, version_base="1.3"):
-        plain = compose(config_name)
+    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+        paths = [override for override in overrides if override.startswith(_SEARCH_PATH)]
         groups = GlobalHydra.instance().config_loader().list_groups("")
         try:
-            jobs = _jobs(overrides) if multirun else [list(overrides)]
+            plain = compose(config_name, paths)
+            jobs, searches = [list(overrides)], False
+            if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
+                raise UserError("a search is a multirun: add -m.")
+            if multirun:
+                jobs, searches = planned_jobs(overrides, config_name=config_name)
+                if searches and check_searchable is None:
+                    raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
             _raise_first(unknown_setting(o, plain, groups) for o in jobs[0] if "." not in o.partition("=")[0])
-            defaults = compose(config_name, [o for o in jobs[0] if _chooses_group(o)])
+            defaults = compose(config_name, [*paths, *(o for o in jobs[0] if _chooses_group(o))])
             _raise_first(unknown_setting(override, defaults, groups) for override in jobs[0])
         except CONFIGURATION_ERRORS as error:
             raise UserError(explain(error)) from error
         for job in jobs:
             try:
-                check(compose(config_name, job), job)
+                config = compose(config_name, job)
+                if searches and check_searchable is not None:
+                    check_searchable(config)
+                check(config, job)
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
+
+
+def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
+    """The overrides, with a ``--config-dir`` as one of them; None if there are other flags than of multirun."""
+    overrides, flags = [], set()
+    left = iter(arguments)
+    for argument in left:
+        name, equals, value = argument.partition("=")
+        if name in ("--config-dir", "-cd"):
+            folder = Path(value if equals else next(left, "")).absolute()
+            overrides.append(f"{_SEARCH_PATH}['file://{folder}']")
+        elif argument.startswith("-"):
+            flags.add(argument)
+        else:
+            overrides.append(argument)
+    one_path = sum(override.startswith(_SEARCH_PATH) for override in overrides) <= 1
+    return overrides if flags <= MULTIRUN_FLAGS and one_path else None
 
 
 def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:
@@ -99,12 +131,6 @@ def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:
             f"{key} = {folder} is not allowed: no file can be written in {existing} ({error.strerror}). Choose "
             f"another folder with {key}=PATH."
         ) from error
-
-
-def _jobs(overrides: Sequence[str]) -> list[list[str]]:
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    return jobs
 
 
 def _chooses_group(override: str) -> bool:

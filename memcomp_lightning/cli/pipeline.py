@@ -7,7 +7,6 @@ from typing import Any, cast
 import lightning.pytorch as pl
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
@@ -16,6 +15,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
+from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
@@ -74,6 +74,9 @@ def run(
         score = evaluate(module.network, plan.finetuning.data.test_dataloader(), module.loss)
         result["test_accuracy"] = _numbers(score.accuracy)
         result["test_loss"] = _numbers(score.mean_loss)
+        if plan.finetuning.data.validation is not None:
+            held_out = evaluate(module.network, plan.finetuning.data.val_dataloader(), module.loss)
+            result["validation_accuracy"] = _numbers(held_out.accuracy)
     if is_global_zero and not config.trainer.fast_dev_run:
         _log_final(loggers, config, result)
         folder.finish(result)
@@ -114,7 +117,7 @@ def make_trainer(
         require(name not in _NOT_WITH_OWN_STEPS, f"trainer.{name}", value, allowed, "Use batch_size.")
     settings = OmegaConf.to_container(config.trainer, resolve=True)
     assert isinstance(settings, dict)
-    require_count("trainer.checkpoint_every", settings.pop("checkpoint_every"))
+    require_count("checkpoint_every", config.checkpoint_every)
     trainer: pl.Trainer = instantiate(
         settings,
         _convert_="all",
@@ -135,7 +138,7 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
     keep_last = ModelCheckpoint(
         dirpath=path.parent,
         filename=path.stem,
-        every_n_epochs=config.trainer.checkpoint_every,
+        every_n_epochs=config.checkpoint_every,
         save_on_train_epoch_end=True,
         enable_version_counter=False,
     )

@@ -145,7 +145,7 @@ def _source() -> str:
 
 _FREE_TO_CHANGE = (
     "logger.",
-    "trainer.checkpoint_every",
+    "checkpoint_every",
     "data.source.data_dir",
     "data.source.download",
     "figure.workers",

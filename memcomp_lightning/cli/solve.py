@@ -8,12 +8,12 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, refuse
+from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
 from memcomp_lightning.cli.overrides import (
     CONFIG_MODULE,
     check_command_line,
@@ -49,7 +49,7 @@ _SETTINGS = ("problem", "format", "maximise", "seed", "solver")
 _LONGEST_PRINTED = 100
 
 
-@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="solve", version_base="1.3")
+@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="solve", **MAIN)
 def solve(config: DictConfig) -> None:
     """One problem, or one job of a sweep."""
     try:

@@ -35,7 +35,9 @@ def merge(folder: Path) -> tuple[str, int]:
     """
     groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]] = defaultdict(list)
     failed: list[tuple[str, str]] = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+    # Launchers keep their own files in folders such as .submitit.
+    jobs = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    for path in sorted(jobs):
         job = RunFolder(path)
         if (result := job.result) is not None:
             groups[tuple((k, v) for k, v in result["overrides"].items() if k != "seed")].append(result)
@@ -48,11 +50,18 @@ def merge(folder: Path) -> tuple[str, int]:
     return text, len(failed)
 
 
+_HELD_OUT = ("held-out accuracy", "validation_accuracy_mean", "validation_accuracy_error")
+"""On held-out training images: left out where no job holds any out."""
+
+
 def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], folder: Path) -> str:
     settings = [dict(key) for key in groups]
     names = list(dict.fromkeys(name for setting in settings for name in setting))
     swept = [name for name in names if len({setting.get(name) for setting in settings}) > 1]
-    screen = [[*swept, "runs x replicas", "energy gap, top layer", "test accuracy", "wall time"]]
+    held_out = any("validation_accuracy" in result for results in groups.values() for result in results)
+    screen = [
+        [*swept, "runs x replicas", "energy gap, top layer", *_HELD_OUT[:held_out], "test accuracy", "wall time"]
+    ]
     sheet: list[list[Any]] = [
         [
             *swept,
@@ -60,6 +69,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
             "n_values",
             "energy_gap_mean",
             "energy_gap_error",
+            *_HELD_OUT[1 : 1 + 2 * held_out],
             "test_accuracy_mean",
             "test_accuracy_error",
             "wall_time_s",
@@ -74,6 +84,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
             for gap in (result["stages"].get("pretrain", {}).get("energy_gap") or [[]])[-1]
         ]
         accuracies = [accuracy for result in results for accuracy in result.get("test_accuracy", [])]
+        judged = [accuracy for result in results for accuracy in result.get("validation_accuracy", [])]
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
         values = [setting.get(name, "") for name in swept]
         n_values = max(len(gaps), len(accuracies))
@@ -82,6 +93,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 *values,
                 f"{len(results)} x {n_values // len(results)}",
                 with_error(gaps) if gaps else "",
+                *([with_error(judged) if judged else ""] * held_out),
                 with_error(accuracies) if accuracies else "",
                 f"{sum(seconds) / len(seconds):.1f} s",
             ]
@@ -92,6 +104,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 len(results),
                 n_values,
                 *(mean_and_error(gaps) if gaps else ("", "")),
+                *((mean_and_error(judged) if judged else ("", "")) * held_out),
                 *(mean_and_error(accuracies) if accuracies else ("", "")),
                 sum(seconds) / len(seconds),
             ]

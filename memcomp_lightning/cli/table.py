@@ -49,7 +49,9 @@ def run_table(result: dict[str, Any]) -> str:
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"
     choice = result.get("choice")
     chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
-    return aligned(rows) + chosen
+    judged = result.get("validation_accuracy")
+    held_out = f"\nAccuracy on held-out training images: {with_error(judged)}" if judged else ""
+    return aligned(rows) + chosen + held_out
 
 
 def closing_lines(folder: Path) -> str:

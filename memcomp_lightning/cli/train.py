@@ -20,8 +20,10 @@ from memcomp_lightning.cli import figures, pipeline, report, sweep, trajectory, 
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
+from memcomp_lightning.cli.hydra_versions import MAIN
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
 from memcomp_lightning.cli.run_folder import RunFolder
+from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.modules import CheckpointError, DivergedError
@@ -31,15 +33,20 @@ COMMAND = "memcomp-train"
 log = logging.getLogger(__name__)
 
 
-@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", version_base="1.3")
-def train(config: DictConfig) -> None:
-    """One run, or one job of a sweep."""
+@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", **MAIN)
+def train(config: DictConfig) -> float | None:
+    """One run, or one job of a sweep.
+
+    Returns:
+        What a search goes by: accuracy on held-out training images after the last pass, mean over replicas; 0 of a
+        job that diverged. None where no images are held out, or a job failed.
+    """
     _silence_lightning()  # again: a job of a parallel launcher is in a process of its own
     settings = HydraConfig.get()
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
-        _train(config, folder, list(settings.overrides.task))
+        return _train(config, folder, list(settings.overrides.task))
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(COMMAND, error)
@@ -47,6 +54,7 @@ def train(config: DictConfig) -> None:
             raise
         folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
         log.error("Failed, the sweep goes on: %s", explain(error))
+        return 0.0 if isinstance(error, DivergedError) else None
 
 
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -77,10 +85,10 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
         stage.data.train_batches(0, trainer.world_size)
 
 
-def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
+def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float | None:
     if config.figure is not None or config.worth is not None:
         _many(config, folder, overrides)
-        return
+        return None
     if _is_first_process():
         folder.open(config, overrides)
     result = folder.result
@@ -94,6 +102,8 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
         print(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}", flush=True)
+    held_out = result.get("validation_accuracy")
+    return sum(held_out) / len(held_out) if held_out else None
 
 
 def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
@@ -155,7 +165,13 @@ def main() -> None:
                 "processes. Give the jobs one by one, or use one device with a parallel launcher."
             )
         if "LOCAL_RANK" not in os.environ:
-            check_command_line(sys.argv[1:], config_name="config", check=_check, folders=("runs", "multirun"))
+            check_command_line(
+                sys.argv[1:],
+                config_name="config",
+                check=_check,
+                folders=("runs", "multirun"),
+                check_searchable=check_searchable,
+            )
         train()
     except UserError as error:
         refuse(COMMAND, error)

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.build import Plan, build
 from memcomp_lightning.cli.figures import composed_for
+from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.report import save
 from memcomp_lightning.cli.units import pretrained
 from memcomp_lightning.dmm import DmmSolver, Recording

@@ -11,11 +11,11 @@ __all__ = [*_OF_DIMOD, "DmmDimodSampler", "QpuSampler", "annealer_graph"]
 
 def __getattr__(name: str) -> Any:
     """Import what needs dimod when it is asked for."""
-    if name in _OF_DIMOD:
-        from memcomp_lightning.interop import dimod
+    if name in (*_OF_DIMOD, "DmmDimodSampler"):
+        from memcomp_lightning.interop import dimod  # first: it says what to install
 
-        return getattr(dimod, name)
-    if name == "DmmDimodSampler":
+        if name in _OF_DIMOD:
+            return getattr(dimod, name)
         from memcomp_lightning.interop.dmm_sampler import DmmDimodSampler
 
         return DmmDimodSampler

@@ -49,9 +49,9 @@ def annealer_graph(kind: Kind, size: int, n_visible: int) -> Int[Tensor, "n_pair
 def _dwave_graphs() -> Any:
     try:
         from dwave import graphs
-    except ImportError as error:
+    except ImportError:
         raise ModuleNotFoundError(
             "Graphs of annealers come from dwave-graphs, which is not installed: "
             "pip install 'memcomp-lightning[dimod]'."
-        ) from error
+        ) from None
     return graphs

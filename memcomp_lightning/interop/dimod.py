@@ -18,10 +18,10 @@ from memcomp_lightning.types import Configurations, NegativePhase
 
 try:
     from dimod import BinaryQuadraticModel, Vartype
-except ModuleNotFoundError as error:
+except ModuleNotFoundError:
     raise ModuleNotFoundError(
         "Samplers and solvers of dimod need dimod, which is not installed: pip install 'memcomp-lightning[dimod]'."
-    ) from error
+    ) from None
 
 
 SMALLEST_BETA = 0.01

@@ -4,13 +4,12 @@ import logging
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Any, Literal
 
-import dimod
-import networkx as nx
-from dimod import BinaryQuadraticModel, SampleSet, Vartype
-
 from memcomp_lightning.errors import SettingError, require, require_choice, require_count
 
 try:
+    import dimod
+    import networkx as nx
+    from dimod import BinaryQuadraticModel, SampleSet, Vartype
     from dwave import graphs
     from dwave.embedding import embed_bqm, unembed_sampleset
     from dwave.embedding.chain_breaks import discard, majority_vote
@@ -19,11 +18,11 @@ try:
     from dwave.system import DWaveSampler
     from minorminer import find_embedding
     from minorminer.busclique import busgraph_cache
-except ModuleNotFoundError as error:
+except ModuleNotFoundError:
     raise ModuleNotFoundError(
         "A quantum annealer needs D-Wave's Ocean SDK, which is not installed: "
         "pip install 'memcomp-lightning[dwave]'."
-    ) from error
+    ) from None
 
 log = logging.getLogger(__name__)
 

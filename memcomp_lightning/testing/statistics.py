@@ -4,6 +4,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from memcomp_lightning.models import RBM
+from memcomp_lightning.models.enumeration import binary_states
+
 
 def state_counts(x: Tensor) -> Tensor:
     """Count how often each binary state occurs among rows.
@@ -19,6 +22,20 @@ def state_counts(x: Tensor) -> Tensor:
     return torch.bincount((x.long() * powers).sum(-1), minlength=2**n)
 
 
+@torch.no_grad()
+def visible_probabilities(model: RBM) -> Tensor:
+    """p(v) of every visible state of an RBM by enumeration, in the order of :func:`state_counts`.
+
+    Args:
+        model: With at most 20 visible units.
+
+    Returns:
+        ``(*replicas, 2^n_visible)`` float64.
+    """
+    states = binary_states(model.n_visible, like=model.b).expand(*model.replicas, -1, -1)
+    return torch.softmax(-model.free_energy(states).double(), dim=-1)
+
+
 def chi_square_p_value(counts: Tensor, probabilities: Tensor, *, min_expected: float = 5.0) -> float:
     """Return the p value of Pearson's test of counts against probabilities; rare states are pooled.
 
@@ -30,7 +47,7 @@ def chi_square_p_value(counts: Tensor, probabilities: Tensor, *, min_expected: f
         probabilities: ``(n_states,)``, adding up to one.
         min_expected: States expected less often than this are counted as one.
     """
-    expected = probabilities.double() * counts.sum()
+    expected = probabilities.detach().double() * counts.sum()
     if bool((counts[expected == 0] > 0).any()):
         return 0.0  # A state that cannot occur did.
     rare = expected < min_expected

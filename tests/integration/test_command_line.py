@@ -12,6 +12,7 @@ from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.hydra_versions import INITIALIZE
 
 Run = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"
@@ -44,7 +45,7 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
     small = [*FAST, "sampler=mode_assisted_cd", "pretrain.iterations=3"]
     for batch_size, n_updates in (("null", 3), ("500", 9)):
         overrides = [*small, f"pretrain.batch_size={batch_size}"]
-        with initialize_config_module("memcomp_lightning.conf", version_base="1.3"):
+        with initialize_config_module("memcomp_lightning.conf", **INITIALIZE):
             plan = build(compose("config", overrides))
         assert plan.pretraining is not None
         assert plan.pretraining.module.sampler.schedule.n_updates == n_updates  # type: ignore[attr-defined]
@@ -111,7 +112,7 @@ REFUSED = {
     "model.weights=none.pt": ["none.pt does not exist"],
     "sampler=exact": ["32 is not allowed", "max_units = 16"],
     "trainer.devices=0": ["devices=0"],
-    "trainer.checkpoint_every=0": ["trainer.checkpoint_every = 0", "an integer >= 1"],
+    "checkpoint_every=0": ["checkpoint_every = 0", "an integer >= 1"],
     "hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
     "callbacks.pretrain.momentum_schedule.initial=2": ["momentum initial = 2", "[0, 1)"],
     "+keep=1": ["setting = 'keep'", "'pretrain'"],

@@ -1,12 +1,15 @@
 """The wheel carries its configuration, and another Hydra project reaches it."""
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 import memcomp_lightning
 
@@ -61,7 +64,25 @@ def test_wheel_holds_every_config_and_the_type_marker(wheel: Path) -> None:
     assert expected <= names
     assert "memcomp_lightning/conf/__init__.py" in names
     assert "memcomp_lightning/py.typed" in names
-    assert not [name for name in names if name.startswith(("tests", "conf/", "docs", "site", "mkdocs"))]
+    # No plugin, which a setuptools editable install of another project would hide: see docs/sweeps.md.
+    assert not [name for name in names if name.startswith(("tests", "conf/", "docs", "site", "mkdocs", "hydra_plugins"))]
+
+
+def test_one_version_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert re.fullmatch(r"\d+\.\d+\.\d+((a|b|rc)\d+)?", project["version"])
+    assert project["version"] == memcomp_lightning.__version__ == citation["version"]
+    assert project["license"] == citation["license"]
+    # What the schema of version 1.2.0 requires, and its two kinds of authors.
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= citation.keys()
+    for work in (citation, *citation["references"]):
+        assert all(
+            "name" in author or {"family-names", "given-names"} <= author.keys() for author in work["authors"]
+        )
+    assert all({"type", "title"} <= reference.keys() for reference in citation["references"])
+    assert (ROOT / "CHANGELOG.md").read_text().count("## [Unreleased]") == 1
 
 
 def test_command_line_from_the_wheel(installed: Path, tmp_path: Path) -> None:

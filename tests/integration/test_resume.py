@@ -19,7 +19,7 @@ RUN = [
     "pretrain.iterations=20",
     "pretrain.batch_size=300",
     "finetune.iterations=40",
-    "trainer.checkpoint_every=1",
+    "checkpoint_every=1",
 ]
 
 

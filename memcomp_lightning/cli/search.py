@@ -1,0 +1,87 @@
+"""Multiruns before they start: which jobs there will be, and whether their sweeper can search."""
+
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from hydra import compose
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig
+
+from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.errors import require
+
+
+def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[list[str]], bool]:
+    """Jobs that a multirun will do, and whether its sweeper searches.
+
+    A search (``hydra/sweeper=optuna``) decides on its jobs by what earlier ones returned. In their place stand
+    those in which one setting after the other takes each of its choices, or the ends of its interval.
+    """
+    parsed = _parsed(overrides)
+    # Other settings may need a group that is swept: sampler.k of sampler=cd,pcd.
+    of_sweeper = [o.input_line or "" for o in parsed if o.is_hydra_override() or o.key_or_group == "hparams"]
+    sweeper = compose(config_name, of_sweeper, return_hydra_config=True).hydra.sweeper
+    _check_storage(sweeper.get("storage"))
+    settings = {}
+    for override in [*_parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()]), *parsed]:
+        settings[override.get_key_element()] = override
+    if sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
+        (jobs,) = BasicSweeper.split_arguments(list(settings.values()), None)
+        return jobs, False
+    values = [_values(override) for override in settings.values()]
+    first = [options[0] for options in values]
+    others = [
+        [*first[:position], option, *first[position + 1 :]]
+        for position, options in enumerate(values)
+        for option in options[1:]
+    ]
+    return [first, *others], True
+
+
+def check_searchable(config: DictConfig) -> None:
+    """Refuse a job that returns nothing to search by.
+
+    Raises:
+        SettingError: Naming the setting.
+    """
+    require(
+        config.figure is None and config.worth is None, "experiment", "one of many runs", "one run in a search"
+    )
+    require(
+        config.data.validation_fraction > 0,
+        "data.validation_fraction",
+        config.data.validation_fraction,
+        "a share above 0 of the training images in a search",
+        "The test images would choose the settings.",
+    )
+    n_passes = config.finetune.iterations
+    require(n_passes > 0, "finetune.iterations", n_passes, "an integer >= 1 in a search, which goes by accuracy")
+
+
+def _check_storage(storage: object) -> None:
+    """Refuse what would end in an AssertionError inside optuna."""
+    if storage is None:
+        return
+    optuna, sqlalchemy = version("optuna"), version("sqlalchemy")
+    if int(optuna.partition(".")[0]) < 3 and int(sqlalchemy.partition(".")[0]) >= 2:
+        raise UserError(
+            f"hydra.sweeper.storage = {storage!r} is not allowed: optuna {optuna} cannot use SQLAlchemy "
+            f"{sqlalchemy}. Leave it null: with hydra.sweep.dir=FOLDER the same command goes on from the jobs in "
+            "that folder. Or take Hydra 1.4 with hydra-optuna-sweeper 1.4."
+        )
+
+
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _values(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if override.is_interval_sweep():
+        interval = override.value()
+        return [f"{key}={end}" for end in (interval.start, interval.end)]  # type: ignore[union-attr]
+    if override.is_sweep_override():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [override.input_line or ""]

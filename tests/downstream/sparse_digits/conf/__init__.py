@@ -1,0 +1,1 @@
+"""Hydra configuration of this project; other projects reach it as ``pkg://sparse_digits.conf``."""

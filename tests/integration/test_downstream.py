@@ -1,0 +1,175 @@
+"""Another project uses the built wheel, in an environment of its own, with the release candidate of Hydra 1.4.
+
+``tests/downstream`` is that project. Nothing of the checkout is on its path.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import memcomp_lightning
+
+pytestmark = pytest.mark.xdist_group("downstream")
+
+ROOT = Path(memcomp_lightning.__file__).parents[1]
+HYDRA = "1.4.0rc3"
+OTHER_VERSIONS = r"(hydra-.*|omegaconf|antlr4-.*|optuna)=="
+"""Lines of constraints.txt that belong to Hydra 1.3, with which all other tests run."""
+
+FAST = ["pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"]
+
+
+def run(*command: str | Path, folder: Path, status: int = 0) -> str:
+    """Output of a command that ends with ``status``; the checkout is not on its path."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST_"))}
+    environment |= {"OMP_NUM_THREADS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+    done = subprocess.run([*map(str, command)], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == status, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="session")
+def constraints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    lines = (ROOT / "constraints.txt").read_text().splitlines(keepends=True)
+    path = tmp_path_factory.mktemp("constraints") / "constraints.txt"
+    path.write_text("".join(line for line in lines if not re.match(OTHER_VERSIONS, line, re.IGNORECASE)))
+    return path
+
+
+@pytest.fixture(scope="session")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the project, far from the checkout."""
+    return Path(shutil.copytree(ROOT / "tests/downstream", tmp_path_factory.mktemp("project") / "sparse-digits"))
+
+
+@pytest.fixture(scope="session")
+def python(project: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Interpreter of an environment with the wheel, the project and what they require."""
+    folder = tmp_path_factory.mktemp("environment")
+    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", folder, ".", folder=ROOT)
+    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", folder, ".", folder=project)
+    run(sys.executable, "-m", "venv", folder / "venv", folder=folder)
+    python = folder / "venv/bin/python"
+    packages = [f"hydra-core=={HYDRA}", "pytest", *folder.glob("*.whl")]
+    run(python, "-m", "pip", "install", "--no-compile", "-c", constraints, *packages, folder=folder)
+    return python
+
+
+@pytest.fixture(scope="session")
+def python_with_plugins(python: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second environment on top of it, with the extra for sweeps."""
+    folder = tmp_path_factory.mktemp("plugins")
+    run(sys.executable, "-m", "venv", folder / "venv", folder=folder)
+    packages = "lib/python{}.{}/site-packages".format(*sys.version_info)
+    (folder / "venv" / packages / "below.pth").write_text(f"{python.parents[1] / packages}\n")
+    python = folder / "venv/bin/python"
+    plugins = [f"hydra-{name}=={HYDRA}" for name in ("joblib-launcher", "optuna-sweeper", "submitit-launcher")]
+    run(python, "-m", "pip", "install", "-c", constraints, "memcomp-lightning[sweep]", *plugins, folder=folder)
+    return python
+
+
+def test_it_is_the_wheel_with_hydra_1_4(python: Path, tmp_path: Path) -> None:
+    code = "import hydra, memcomp_lightning as m; print(hydra.__version__, m.__version__, m.__file__)"
+    version, own, file = run(python, "-c", code, folder=tmp_path).split()
+    assert (version, own) == (HYDRA, memcomp_lightning.__version__)
+    assert Path(file).is_relative_to(python.parents[1])
+
+
+def test_its_module_trains_with_our_callbacks(python: Path, tmp_path: Path) -> None:
+    out = run(python.parent / "sparse-digits", "max_epochs=3", "hydra.run.dir=run", folder=tmp_path)
+    assert "RandomScan: sparsity 0." in out
+    header = (tmp_path / "run/csv/version_0/metrics.csv").read_text().splitlines()[0].split(",")
+    for name in ("reconstruction_error", "free_energy_gap", "energy_model", "negative_phase/bits_changed"):
+        assert f"SparseRBM/{name}" in header
+
+
+def test_its_multirun_takes_its_sampler_and_ours(python: Path, tmp_path: Path) -> None:
+    sweep = ["-m", "sampler=random_scan,cd", "max_epochs=1"]
+    out = run(python.parent / "sparse-digits", *sweep, folder=tmp_path)
+    assert re.findall(r"^(\w+): sparsity", out, flags=re.MULTILINE) == ["RandomScan", "CD"]
+
+
+def test_its_sampler_pretrains_our_dbn(python: Path, tmp_path: Path) -> None:
+    train = [python.parent / "memcomp-train", "hydra.searchpath=[pkg://sparse_digits.conf]", "sampler=random_scan"]
+    run(*train, *FAST, "hydra.run.dir=run", folder=tmp_path)
+    assert len(json.loads((tmp_path / "run/result.json").read_text())["stages"]["pretrain"]["energy_gap"]) == 2
+
+
+def test_its_own_tests_pass(python: Path, project: Path) -> None:
+    assert "4 passed" in run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", folder=project)
+
+
+def test_help_of_our_command(python: Path, tmp_path: Path) -> None:
+    out = run(python.parent / "memcomp-train", "--help", folder=tmp_path)
+    assert "sampler: annealer, cd, dmm_qubo" in out
+    assert "hparams: pretraining" in out
+
+
+def test_our_types_are_seen(python: Path, project: Path, tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text("from memcomp_lightning.models import RBM\n\nRBM('three', 2)\n")
+    mypy = [sys.executable, "-m", "mypy", "--python-executable", python, "--cache-dir", os.devnull]
+    out = run(*mypy, "sparse_digits", wrong, folder=project, status=1)
+    assert 'wrong.py:3: error: Argument 1 to "RBM" has incompatible type "str"; expected "int"' in out
+    assert "Found 1 error in 1 file" in out
+
+
+WITHOUT_EXTRAS = {
+    "sampler=annealer": "dimod",
+    "solver=dimod": "dimod",
+    "model=zephyr": "dimod",
+    "-m hydra/launcher=joblib": "sweep",
+    "-m hydra/launcher=submitit_local": "sweep",
+    "-m hparams=pretraining": "sweep",
+}
+
+EACH_IN_TURN = """
+import contextlib, sys
+from hydra.core.global_hydra import GlobalHydra
+from memcomp_lightning.cli import train
+
+for arguments in sys.argv[1:]:
+    sys.argv[1:] = arguments.split()
+    GlobalHydra.instance().clear()
+    with contextlib.suppress(SystemExit):
+        train.main()
+"""
+
+
+def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_path: Path) -> None:
+    messages = run(python, "-c", EACH_IN_TURN, *WITHOUT_EXTRAS, folder=tmp_path).splitlines()
+    for message, extra in zip(messages, WITHOUT_EXTRAS.values(), strict=True):
+        assert message.startswith("memcomp-train: ")
+        assert message.endswith(f"pip install 'memcomp-lightning[{extra}]'.")
+
+
+def test_imports_without_extras(python: Path, tmp_path: Path) -> None:
+    code = """
+import importlib, pkgutil, memcomp_lightning
+needs = {"memcomp_lightning.interop." + name for name in ("dimod", "dmm_sampler", "qpu")}
+for module in pkgutil.walk_packages(memcomp_lightning.__path__, "memcomp_lightning."):
+    if module.name not in needs:
+        importlib.import_module(module.name)
+for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
+    try:
+        getattr(memcomp_lightning.interop, name)
+    except ModuleNotFoundError as error:
+        print(name, error)
+"""
+    out = run(python, "-c", code, folder=tmp_path)
+    extras = re.findall(r"^(\w+) .*pip install 'memcomp-lightning\[(\w+)\]'\.$", out, flags=re.MULTILINE)
+    assert extras == [("DimodSolver", "dimod"), ("DmmDimodSampler", "dimod"), ("QpuSampler", "dwave")]
+
+
+def test_parallel_search_with_hydra_1_4(python_with_plugins: Path, tmp_path: Path) -> None:
+    train = [python_with_plugins, "-m", "memcomp_lightning.cli.train", "-m", "callbacks=minimal", *FAST]
+    search = ["hparams=pretraining", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra/launcher=joblib"]
+    storage = ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=trials"]
+    run(*train, "sampler=cd", *search, *storage, "hydra.sweep.dir=search", folder=tmp_path)
+    assert "best_value" in (tmp_path / "search/optimization_results.yaml").read_text()
