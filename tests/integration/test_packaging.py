@@ -65,7 +65,9 @@ def test_wheel_holds_every_config_and_the_type_marker(wheel: Path) -> None:
     assert "memcomp_lightning/conf/__init__.py" in names
     assert "memcomp_lightning/py.typed" in names
     # No plugin, which a setuptools editable install of another project would hide: see docs/sweeps.md.
-    assert not [name for name in names if name.startswith(("tests", "conf/", "docs", "site", "mkdocs", "hydra_plugins"))]
+    assert not [
+        name for name in names if name.startswith(("tests", "conf/", "docs", "site", "mkdocs", "hydra_plugins"))
+    ]
 
 
 def test_one_version_everywhere() -> None:
