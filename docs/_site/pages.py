@@ -35,8 +35,12 @@ TITLES = {
 MADE_BY_RUNS = {"results", "cache"}
 SHOWN = (".md", ".png", ".svg", ".csv", ".json")
 
-# Pages of the repository's top level that others link to.
-TOP_PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+# Pages of the repository outside docs that others link to.
+TOP_PAGES = {
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "tests/downstream/README.md": "downstream.md",
+}
 
 GROUP_TEXTS = {
     "callbacks": "What is looked at while training runs; [all callbacks](../callbacks.md).",
