@@ -51,9 +51,9 @@ def explain(error: BaseException) -> str:
         group, _, option = error.missing_cfg_file.rpartition("/")
         close = difflib.get_close_matches(option, error.options, n=1)
         hint = f" Did you mean {group}={close[0]}?" if close else ""
-        if group in ("hydra/launcher", "hydra/sweeper"):
-            hint += " Plugins of Hydra: pip install 'memcomp-lightning[sweep]'."
-        return f"{group} = {option!r} does not exist.{hint} Known here: {', '.join(error.options)}."
+        plugin = group in ("hydra/launcher", "hydra/sweeper")
+        remedy = " Plugins of Hydra: pip install 'memcomp-lightning[sweep]'." if plugin else ""
+        return f"{group} = {option!r} does not exist.{hint} Known here: {', '.join(error.options)}.{remedy}"
     if isinstance(error, HydraException):
         text, _, _ = str(error).partition("\nConfig search path:")
         reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]
