@@ -25,6 +25,7 @@ TITLES = {
     "figure5": "Figure 5",
     "figure6": "Figure 6",
     "readings": "Other readings",
+    "annealer": "An annealer",
     "sampler_worth": "What a sampler is worth",
     "likelihood": "Log-likelihoods",
     "joint_pretraining": "Joint pretraining",
