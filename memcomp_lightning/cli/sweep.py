@@ -50,18 +50,13 @@ def merge(folder: Path) -> tuple[str, int]:
     return text, len(failed)
 
 
-_HELD_OUT = ("held-out accuracy", "validation_accuracy_mean", "validation_accuracy_error")
-"""On held-out training images: left out where no job holds any out."""
-
-
 def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], folder: Path) -> str:
     settings = [dict(key) for key in groups]
     names = list(dict.fromkeys(name for setting in settings for name in setting))
     swept = [name for name in names if len({setting.get(name) for setting in settings}) > 1]
     held_out = any("validation_accuracy" in result for results in groups.values() for result in results)
-    screen = [
-        [*swept, "runs x replicas", "energy gap, top layer", *_HELD_OUT[:held_out], "test accuracy", "wall time"]
-    ]
+    held_out_title = ["held-out accuracy"] if held_out else []
+    screen = [[*swept, "runs x replicas", "energy gap, top layer", *held_out_title, "test accuracy", "wall time"]]
     sheet: list[list[Any]] = [
         [
             *swept,
@@ -69,7 +64,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
             "n_values",
             "energy_gap_mean",
             "energy_gap_error",
-            *_HELD_OUT[1 : 1 + 2 * held_out],
+            *(["validation_accuracy_mean", "validation_accuracy_error"] if held_out else []),
             "test_accuracy_mean",
             "test_accuracy_error",
             "wall_time_s",
@@ -93,7 +88,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 *values,
                 f"{len(results)} x {n_values // len(results)}",
                 with_error(gaps) if gaps else "",
-                *([with_error(judged) if judged else ""] * held_out),
+                *([with_error(judged) if judged else ""] if held_out else []),
                 with_error(accuracies) if accuracies else "",
                 f"{sum(seconds) / len(seconds):.1f} s",
             ]
@@ -104,7 +99,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 len(results),
                 n_values,
                 *(mean_and_error(gaps) if gaps else ("", "")),
-                *((mean_and_error(judged) if judged else ("", "")) * held_out),
+                *((mean_and_error(judged) if judged else ("", "")) if held_out else ()),
                 *(mean_and_error(accuracies) if accuracies else ("", "")),
                 sum(seconds) / len(seconds),
             ]
