@@ -187,7 +187,7 @@ def _connected() -> Any:
         raise SettingError(
             f"D-Wave's service cannot be used: {error}. Set DWAVE_API_TOKEN, or run `dwave config create`; "
             "sampler=annealer needs neither."
-        ) from error
+        ) from None
 
 
 def _without_faults(qpu: Any) -> nx.Graph:

@@ -110,6 +110,7 @@ REFUSED = {
     "seed=1.5": ["seed = 1.5", "an integer"],
     "model.hidden_sizes=[0]": ["n_hidden = 0", "an integer >= 1"],
     "model.weights=none.pt": ["none.pt does not exist"],
+    "sampler=dwave_qpu": ["Set DWAVE_API_TOKEN", "sampler=annealer needs neither"],
     "sampler=exact": ["32 is not allowed", "max_units = 16"],
     "trainer.devices=0": ["devices=0"],
     "checkpoint_every=0": ["checkpoint_every = 0", "an integer >= 1"],
