@@ -73,7 +73,7 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         require(structured, "qpu", type(self.qpu).__name__, "a structured dimod sampler, such as DWaveSampler")
         self.n_gauges, self.chain_strength, self.chain_breaks = n_gauges, chain_strength, chain_breaks
         self.faulty, self.seed = faulty, seed
-        self._known: dict[frozenset[frozenset[Unit]], Embedding] = {}
+        self._known: dict[tuple[frozenset[Unit], frozenset[frozenset[Unit]]], Embedding] = {}
         self._warned = False
 
     @property
@@ -127,8 +127,8 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         Raises:
             SettingError: There is none on this annealer.
         """
-        pairs = frozenset(frozenset(pair) for pair in bqm.quadratic)
-        if pairs not in self._known:
+        graph = frozenset(bqm.variables), frozenset(frozenset(pair) for pair in bqm.quadratic)
+        if graph not in self._known:
             working = self.qpu.to_networkx_graph()
             whole = working if self.faulty == "avoid" else _without_faults(self.qpu)
             found = _layout(bqm, whole, self.seed)
@@ -141,8 +141,8 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
                 f"one that fits on {type(self.qpu).__name__} with its {len(working)} qubits",
                 "Take fewer units, a larger annealer, or faulty='prune'.",
             )
-            self._known[pairs] = chains
-        return self._known[pairs]
+            self._known[graph] = chains
+        return self._known[graph]
 
     def _strength(self, bqm: BinaryQuadraticModel, embedding: Embedding) -> float:
         if self.chain_strength is None:

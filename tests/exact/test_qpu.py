@@ -200,7 +200,10 @@ def test_reads_that_cannot_be_divided_are_refused():
 
 def test_a_single_unit_and_units_alone_have_their_qubits():
     alone = Qubo.from_matrix(torch.diag(torch.tensor([1.0, -2.0, 3.0])))
-    assert QpuSampler(Annealer()).sample(to_bqm(alone), num_reads=2, seed=0).first.energy == -2.0
+    sampler = QpuSampler(Annealer())
+    assert sampler.sample(to_bqm(alone), num_reads=2, seed=0).first.energy == -2.0
+    more = Qubo.from_matrix(torch.diag(torch.tensor([1.0, -2.0, 3.0, -5.0])))
+    assert sampler.sample(to_bqm(more), num_reads=2, seed=0).first.energy == -7.0
 
 
 def test_without_a_token_the_error_says_what_to_set(monkeypatch, tmp_path):
