@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import logsigmoid
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import RBM, BoltzmannMachine
@@ -27,9 +26,15 @@ except ModuleNotFoundError:
 SMALLEST_BETA = 0.01
 """Estimates stay above: what is asked of a stubborn annealer is finite."""
 
+MAX_NEWTON_STEPS = 100
+"""Of an estimate; six or so are made, and about fifty for states that are all local minima."""
+
 
 def to_bqm(qubo: Qubo) -> BinaryQuadraticModel:
-    """One problem as a binary quadratic model with the variables 0 to n - 1; 20 ms for 784 x 500.
+    """One problem as a binary quadratic model with the variables 0 to n - 1.
+
+    784 x 500 take 20 ms, as long as writing new biases into a model that exists: dimod looks for the place of
+    each coupling either way.
 
     Raises:
         SettingError: Several problems at once.
@@ -192,7 +197,8 @@ def maximum_pseudo_likelihood_beta(
 
     .. math:: \beta^* = \arg\max_\beta \sum_{k, i} \log \sigma(-\beta (2 x_{ki} - 1) f_{ki})
 
-    (Besag 1975), a concave function of one number, found by bisection of its derivative.
+    (Besag 1975), a concave function of one number, found by Newton's method, with bisection where
+    its steps leave the bracket or do not halve.
 
     Args:
         field: f, energy of x_i = 1 less that of x_i = 0 given the other units.
@@ -206,11 +212,19 @@ def maximum_pseudo_likelihood_beta(
     gain = (-(2 * x - 1) * field).double()
     low = torch.zeros(gain.shape[:-2], dtype=torch.float64, device=gain.device)
     high = torch.full_like(low, largest)
-    for _ in range(60):
-        middle = (low + high) / 2
-        slope = (gain * logsigmoid(-middle[..., None, None] * gain).exp()).sum((-2, -1))
-        low, high = torch.where(slope > 0, middle, low), torch.where(slope > 0, high, middle)
-    return (low + high) / 2
+    beta, step = torch.ones_like(low).clamp(max=largest), high
+    for _ in range(MAX_NEWTON_STEPS):
+        doubt = torch.sigmoid(-beta[..., None, None] * gain)
+        slope = (gain * doubt).sum((-2, -1))
+        curvature = (gain.square() * doubt * (1 - doubt)).sum((-2, -1))
+        low, high = torch.where(slope > 0, beta, low), torch.where(slope > 0, high, beta)
+        newton = beta + slope / curvature
+        trusted = (low <= newton) & (newton <= high) & ((newton - beta).abs() <= step / 2)
+        newer = torch.where(trusted, newton, (low + high) / 2)
+        step, beta = (newer - beta).abs(), newer
+        if bool((step <= 1e-12 * largest).all()):
+            break
+    return beta
 
 
 def _problem(qubo: Qubo, index: int) -> Qubo:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Hashable, Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from memcomp_lightning.errors import SettingError, require, require_choice, require_count
 
@@ -28,6 +28,13 @@ log = logging.getLogger(__name__)
 
 Unit = Hashable
 Embedding = dict[Unit, tuple[int, ...]]
+
+
+class Layout(NamedTuple):
+    """Where a model lies on an annealer: the chain of each unit, and couplings for which there is no coupler."""
+
+    chains: Embedding
+    uncoupled: list[tuple[Unit, Unit]]
 
 
 class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
@@ -73,7 +80,7 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         require(structured, "qpu", type(self.qpu).__name__, "a structured dimod sampler, such as DWaveSampler")
         self.n_gauges, self.chain_strength, self.chain_breaks = n_gauges, chain_strength, chain_breaks
         self.faulty, self.seed = faulty, seed
-        self._known: dict[tuple[frozenset[Unit], frozenset[frozenset[Unit]]], Embedding] = {}
+        self._known: dict[tuple[frozenset[Unit], frozenset[frozenset[Unit]]], Layout] = {}
         self._warned = False
 
     @property
@@ -104,8 +111,9 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         """
         each, rest = divmod(num_reads, self.n_gauges)
         require(rest == 0 < each, "num_reads", num_reads, f"a multiple of n_gauges = {self.n_gauges}")
-        embedding, spin = self.embedding(bqm), bqm.change_vartype(Vartype.SPIN, inplace=False)
-        kept = self._pruned(spin, embedding) if self.faulty == "prune" else spin
+        (embedding, uncoupled), spin = self.layout(bqm), bqm.change_vartype(Vartype.SPIN, inplace=False)
+        kept = BinaryQuadraticModel(spin) if uncoupled else spin
+        kept.remove_interactions_from(uncoupled)
         target: Any = embed_bqm(kept, embedding, self.qpu.adjacency, chain_strength=self._strength)
         self._fit(target)
         if "auto_scale" in self.qpu.parameters:
@@ -121,8 +129,8 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         answer: SampleSet = found.change_vartype(bqm.vartype, inplace=False)
         return answer
 
-    def embedding(self, bqm: BinaryQuadraticModel) -> Embedding:
-        """The chain of each unit, found once for a graph.
+    def layout(self, bqm: BinaryQuadraticModel) -> Layout:
+        """The place of a model, found once for a graph.
 
         Raises:
             SettingError: There is none on this annealer.
@@ -141,7 +149,7 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
                 f"one that fits on {type(self.qpu).__name__} with its {len(working)} qubits",
                 "Take fewer units, a larger annealer, or faulty='prune'.",
             )
-            self._known[graph] = chains
+            self._known[graph] = Layout(chains, self._uncoupled(bqm, chains))
         return self._known[graph]
 
     def _strength(self, bqm: BinaryQuadraticModel, embedding: Embedding) -> float:
@@ -149,14 +157,11 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
             return float(uniform_torque_compensation(bqm, embedding))
         return self.chain_strength * max((abs(value) for value in bqm.quadratic.values()), default=1.0)
 
-    def _pruned(self, bqm: BinaryQuadraticModel, embedding: Embedding) -> BinaryQuadraticModel:
-        """The model without the couplings for which there is no coupler."""
-        near, kept = self.qpu.adjacency, BinaryQuadraticModel(bqm)
-        missing = [
-            (u, v) for u, v in bqm.quadratic if not any(near[qubit] & set(embedding[v]) for qubit in embedding[u])
-        ]
-        kept.remove_interactions_from(missing)
-        return kept
+    def _uncoupled(self, bqm: BinaryQuadraticModel, chains: Embedding) -> list[tuple[Unit, Unit]]:
+        if self.faulty == "avoid":
+            return []
+        near = self.qpu.adjacency
+        return [(u, v) for u, v in bqm.quadratic if not any(near[qubit] & set(chains[v]) for qubit in chains[u])]
 
     def _fit(self, target: Any) -> None:
         """Shrink a problem that is beyond the range of the qubits.

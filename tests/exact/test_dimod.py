@@ -115,6 +115,10 @@ def test_the_inverse_temperature_of_samples_is_found(beta):
     assert maximum_pseudo_likelihood_beta(from_model(rbm).field(ground), ground).tolist() == pytest.approx(
         [100, 100]
     )
+    worst = 1 - ground
+    assert maximum_pseudo_likelihood_beta(from_model(rbm).field(ground), worst).tolist() == pytest.approx(
+        [0, 0], abs=1e-9
+    )
 
 
 def test_the_estimate_makes_an_annealer_of_another_temperature_sample_the_model():
@@ -132,26 +136,27 @@ def test_the_estimate_makes_an_annealer_of_another_temperature_sample_the_model(
     assert float(negative.info["beta_effective"]) == float(state.beta)
 
 
-def test_a_large_model_costs_little():
-    """784 x 500: what is added to an annealer's own time, the least of five."""
+@pytest.mark.parametrize("beta", [1.0, "estimate"])
+def test_a_large_model_costs_little(beta):
+    """784 x 500: what is added to an annealer's own time, processor time, the least of eight updates."""
 
     class Instant(dimod.Sampler):
         parameters, properties = {"num_reads": []}, {}
 
-        def sample(self, bqm, num_reads=10):
-            x = np.zeros((num_reads, bqm.num_variables), dtype=np.int8)
-            energies = np.zeros(num_reads)
-            return dimod.SampleSet.from_samples((x, range(bqm.num_variables)), "BINARY", energies)
+        def sample(self, bqm, num_reads=100):
+            return answer
 
     rbm, generator = RBM(784, 500), rng.stream(0, "negative_phase")
-    sampler = AnnealerSamples(sampler=Instant())
+    x = rng.bernoulli(torch.full((100, 1284), 0.5), generator=generator).to(torch.int8).numpy()
+    answer = dimod.SampleSet.from_samples((x, range(1284)), "BINARY", np.zeros(100))
+    sampler = AnnealerSamples(sampler=Instant(), beta=beta)
     positive, state = positive_phase(rbm, torch.zeros(1, 784)), sampler.init(rbm, 1, generator=generator)
     times = []
-    for _ in range(5):
-        begin = time.perf_counter()
+    for _ in range(8):
+        begin = time.process_time()
         sampler.sample(rbm, state, positive, generator=generator)
-        times.append(time.perf_counter() - begin)
-    assert min(times) < 0.25  # 50 ms on a quiet machine
+        times.append(time.process_time() - begin)
+    assert min(times) < 0.1  # 35 and 39 ms on a quiet machine; neighbours take its caches
 
 
 @pytest.mark.parametrize(

@@ -69,10 +69,10 @@ def test_ground_states_come_back_to_their_units(make, kind):
 
 def test_an_rbm_is_laid_out_once_as_a_biclique():
     sampler, bqm = QpuSampler(Annealer("chimera", [4, 4, 4]), seed=1), to_bqm(from_model(rbm(16, 16)))
-    chains = sampler.embedding(bqm)
+    chains = sampler.layout(bqm).chains
     assert {len(chain) for chain in chains.values()} == {4}  # four cells in a row, four in a column
     assert len({qubit for chain in chains.values() for qubit in chain}) == 128
-    assert sampler.embedding(bqm) is chains
+    assert sampler.layout(bqm).chains is chains
 
 
 def test_reads_are_divided_among_gauges():
@@ -94,7 +94,7 @@ def test_chains_are_as_strong_as_asked():
     sampler.sample(bqm, num_reads=1, seed=0)
     ((model, parameters),) = qpu.given
     assert parameters["auto_scale"] is False
-    chain = next(iter(sampler.embedding(bqm).values()))
+    chain = next(iter(sampler.layout(bqm).chains.values()))
     inside = [abs(model.quadratic[pair]) for pair in model.quadratic if set(pair) <= set(chain)]
     largest = max(abs(value) for value in bqm.spin.quadratic.values())
     assert inside == pytest.approx([1.5 * largest] * 3)
@@ -104,28 +104,28 @@ def test_missing_qubits_are_avoided_or_cost_couplings():
     """A regular layout loses what is broken; around it there is another one, with longer chains or none."""
     whole = QpuSampler(Annealer("chimera", [4, 4, 4]))
     bqm = to_bqm(from_model(rbm(16, 16)))
-    broken = whole.embedding(bqm)[0][1]
+    broken = whole.layout(bqm).chains[0][1]
     at = Annealer("chimera", [4, 4, 4], broken_nodes=[broken])
     pruned = QpuSampler(at, faulty="prune")
-    chains = pruned.embedding(bqm)
+    chains, lost = pruned.layout(bqm)
     assert len({qubit for chain in chains.values() for qubit in chain}) <= 127
     assert all(broken not in chain for chain in chains.values())
-    lost = bqm.num_interactions - pruned._pruned(bqm.spin, chains).num_interactions
-    assert 0 < lost <= 12
+    assert 0 < len(lost) <= 12
     assert len(pruned.sample(bqm, num_reads=3, seed=0)) == 3
     with pytest.raises(SettingError, match=r"of 32 units and 256 couplings.*no place for units.*faulty='prune'"):
         QpuSampler(at).sample(bqm, num_reads=3)
     smaller = to_bqm(from_model(rbm(12, 12)))
-    avoided = QpuSampler(at).embedding(smaller)
+    avoided = QpuSampler(at).layout(smaller).chains
     assert all(broken not in chain for chain in avoided.values())
 
 
 def test_what_is_pruned_is_not_coupled():
     """The samples are those of the model without the lost couplings."""
     qubo = from_model(rbm(16, 16, std=2.0))
-    broken = QpuSampler(Annealer("chimera", [4, 4, 4])).embedding(to_bqm(qubo))[0][1]
+    broken = QpuSampler(Annealer("chimera", [4, 4, 4])).layout(to_bqm(qubo)).chains[0][1]
     sampler = QpuSampler(Annealer("chimera", [4, 4, 4], broken_nodes=[broken]), faulty="prune")
-    kept = sampler._pruned(to_bqm(qubo).spin, sampler.embedding(to_bqm(qubo)))
+    kept = to_bqm(qubo).spin.copy()
+    kept.remove_interactions_from(sampler.layout(to_bqm(qubo)).uncoupled)
     found = sampler.sample(to_bqm(qubo), num_reads=60, seed=0)
     best = min(kept.energies((found.record.sample * 2 - 1, found.variables)))
     reference = SimulatedAnnealingSampler().sample(kept, num_reads=200, seed=1).first.energy
