@@ -3,9 +3,12 @@
 import json
 import re
 import subprocess
+import sys
+import zipfile
 from collections.abc import Callable
 from importlib.metadata import requires, version
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 import yaml
@@ -121,6 +124,67 @@ def test_a_search_path_is_checked_before_training(memcomp_train: Run, tmp_path: 
         assert outcome.status == 2
         assert outcome.err == "memcomp-train: sampler: k = 0 is not allowed: expected an integer >= 1.\n"
         assert not Path("run").exists()
+
+
+HIDDEN = {
+    "project/pyproject.toml": """
+        [build-system]
+        requires = ["setuptools>=64"]
+        build-backend = "setuptools.build_meta"
+        [project]
+        name = "other"
+        version = "0"
+        [tool.setuptools]
+        packages = ["other_conf", "hydra_plugins.other_plugin"]
+    """,
+    "project/other_conf/__init__.py": "",
+    "project/other_conf/word.yaml": "word: found",
+    "project/hydra_plugins/other_plugin/__init__.py": """
+        from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+        class Other(SearchPathPlugin):
+            def manipulate_search_path(self, search_path):
+                search_path.append("other", "pkg://other_conf")
+    """,
+    "conf/by_plugin.yaml": "defaults: [word]",
+    "conf/by_path.yaml": "{defaults: [word], hydra: {searchpath: ['pkg://other_conf']}}",
+    "program.py": """
+        import site, sys
+        site.addsitedir(sys.argv.pop(1))
+        import hydra
+
+        @hydra.main(config_path="conf", version_base="1.3")
+        def main(config):
+            print(config.word)
+
+        main()
+    """,
+}
+
+
+def test_an_editable_install_hides_a_search_path_plugin_but_no_search_path(tmp_path: Path) -> None:
+    """The trap of docs/sweeps.md and its remedy, with a project that setuptools installs in editable mode."""
+    for name, text in HIDDEN.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(dedent(text).strip())
+
+    def python(*arguments: str, folder: Path = tmp_path) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+    build = "from setuptools import build_meta; build_meta.build_editable('..')"
+    built = python("-c", build, folder=tmp_path / "project")
+    assert built.returncode == 0, built.stderr
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        wheel.extractall(tmp_path / "site")
+    hidden = python("program.py", "site", "--config-name", "by_plugin")
+    assert hidden.returncode != 0
+    assert "Could not load 'word'" in hidden.stderr
+    found = python("program.py", "site", "--config-name", "by_path")
+    assert found.stdout == "found\n", found.stderr
+    # As a plain folder on the path, the plugin is seen: it is the install that hides it.
+    (tmp_path / "site/__editable__.other-0.pth").write_text(f"{tmp_path / 'project'}\n")
+    assert python("program.py", "site", "--config-name", "by_plugin").stdout == "found\n"
 
 
 def test_no_extra_pins_cloudpickle() -> None:
