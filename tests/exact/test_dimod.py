@@ -92,6 +92,35 @@ def test_reads_of_different_number_are_marked():
     assert solution.best_energy.tolist() == [0.0, -3.0]
 
 
+class OneAnswer(dimod.Sampler):
+    """As LeapHybridSampler: a time limit, no reads, no seed; one state, in an order of its own."""
+
+    parameters, properties = {"time_limit": ["parameters"], "label": []}, {}
+
+    def sample(self, bqm, time_limit=None, label=""):
+        assert (time_limit, label) == (3, "mine")
+        best = dimod.ExactSolver().sample(bqm).first.sample
+        return dimod.SampleSet.from_samples_bqm(dict(reversed(best.items())), bqm)
+
+
+@pytest.mark.parametrize("make", [small_rbm, small_dbm, small_machine])
+def test_a_hybrid_that_gives_one_answer_is_solver_and_sampler(make):
+    given, generator = {"time_limit": 3, "label": "mine"}, rng.stream(0, "solver")
+    machine = make(replicas=(2,))
+    qubo = from_model(machine)
+    found = DimodSolver(sampler=OneAnswer(), parameters=given).minimise(qubo, generator=generator)
+    exact = BruteForce().minimise(qubo, generator=generator).best
+    torch.testing.assert_close(found.best, exact, rtol=0, atol=0)
+    sampler = AnnealerSamples(sampler=OneAnswer(), parameters=given)
+    positive = positive_phase(machine, torch.zeros(2, 4, machine.n_visible))
+    negative = sampler.sample(
+        machine, sampler.init(machine, 4, generator=generator), positive, generator=generator
+    )
+    v, h, weight = negative.configurations
+    torch.testing.assert_close(torch.cat((v, h), dim=-1), exact.unsqueeze(-2), rtol=0, atol=0)
+    assert weight is None
+
+
 @pytest.mark.parametrize("beta", [1.0, "estimate"])
 @pytest.mark.parametrize("make", [small_rbm, small_dbm, small_machine])
 def test_annealers_keep_the_contract_of_a_sampler(make, beta):

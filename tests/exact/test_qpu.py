@@ -10,11 +10,12 @@ dimod = pytest.importorskip("dimod")
 pytest.importorskip("dwave.system")
 
 from dwave.samplers import SimulatedAnnealingSampler  # noqa: E402
+from dwave.system import EmbeddingComposite  # noqa: E402
 from dwave.system.testing import MockDWaveSampler  # noqa: E402
 
 from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
-from memcomp_lightning.interop import AnnealerSamples, QpuSampler, to_bqm  # noqa: E402
+from memcomp_lightning.interop import AnnealerSamples, DimodSolver, QpuSampler, to_bqm  # noqa: E402
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
 from memcomp_lightning.qubo import BruteForce, Qubo, from_model  # noqa: E402
 from memcomp_lightning.samplers import positive_phase  # noqa: E402
@@ -52,6 +53,16 @@ def rbm(n_visible=7, n_hidden=5, std=0.5):
 def test_annealers_keep_the_contract_of_a_sampler(make, faulty):
     qpu = QpuSampler(Annealer(sweeps=20), n_gauges=2, faulty=faulty)
     check_sampler(AnnealerSamples(sampler=qpu, parameters={"num_reads": 6}, beta="estimate"), make=make)
+
+
+def test_an_annealer_behind_the_composite_of_ocean_is_solver_and_sampler():
+    behind = EmbeddingComposite(Annealer(sweeps=50), embedding_parameters={"random_seed": 1})
+    given = {"num_reads": 6, "return_embedding": False}
+    check_sampler(AnnealerSamples(sampler=behind, parameters=given, beta="estimate"))
+    qubo, generator = from_model(rbm()), rng.stream(0, "solver")
+    found = DimodSolver(sampler=behind, parameters=given).minimise(qubo, generator=generator)
+    exact = BruteForce().minimise(qubo, generator=generator)
+    torch.testing.assert_close(found.best_energy, exact.best_energy, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("kind", GRAPHS)
