@@ -142,21 +142,27 @@ def _members(
             yield from (Member(name, plain, n, seed, value, choosing) for n, seed in missing)
 
 
-@functools.cache
 def composed_for(common: tuple[str, ...], own: tuple[str, ...] = ()) -> DictConfig:
-    """The configuration of one curve, without the figure; not to be changed.
+    """The configuration of one curve, without the figure; composed once, and not to be changed.
 
     Args:
         common: Overrides of all curves. Those that a curve has no setting for are left out: ``solver.max_steps``
             where its solver is descent.
         own: The curve's overrides, which must apply.
     """
-    common = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
+    search_path = tuple(o for o in common if o.startswith("hydra.searchpath="))
+    return _composed(search_path, tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS)), own)
+
+
+@functools.cache
+def _composed(search_path: tuple[str, ...], common: tuple[str, ...], own: tuple[str, ...]) -> DictConfig:
     try:
-        composed = compose("config", [*common, *own])
+        composed = compose("config", [*search_path, *common, *own])
     except ConfigCompositionException:
-        bare = compose("config", [o for o in (*common, *own) if "." not in o.partition("=")[0]])
-        composed = compose("config", [*(o for o in common if _applies(o.partition("=")[0], bare)), *own])
+        groups = (o for o in (*common, *own) if "." not in o.partition("=")[0])
+        bare = compose("config", [*search_path, *groups])
+        applying = (o for o in common if _applies(o.partition("=")[0], bare))
+        composed = compose("config", [*search_path, *applying, *own])
     composed.figure = composed.worth = None
     return composed
 

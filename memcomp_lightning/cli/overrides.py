@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
+from hydra.conf import HydraConf
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
@@ -75,9 +76,7 @@ def check_command_line(
     _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
     with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
         paths = [override for override in overrides if override.startswith(_SEARCH_PATH)]
-        groups = GlobalHydra.instance().config_loader().list_groups("")
         try:
-            plain = compose(config_name, paths)
             jobs, searches = [list(overrides)], False
             if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
                 raise UserError("a search is a multirun: add -m.")
@@ -85,20 +84,30 @@ def check_command_line(
                 jobs, searches = planned_jobs(overrides, config_name=config_name)
                 if searches and check_searchable is None:
                     raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
-            _raise_first(unknown_setting(o, plain, groups) for o in jobs[0] if "." not in o.partition("=")[0])
-            defaults = compose(config_name, [*paths, *(o for o in jobs[0] if _chooses_group(o))])
-            _raise_first(unknown_setting(override, defaults, groups) for override in jobs[0])
         except CONFIGURATION_ERRORS as error:
             raise UserError(explain(error)) from error
         for job in jobs:
             try:
-                config = compose(config_name, job)
+                config = _composed(config_name, job, paths)
                 if searches and check_searchable is not None:
                     check_searchable(config)
                 check(config, job)
             except CONFIGURATION_ERRORS as error:
                 where = f" (job {' '.join(job)})" if multirun else ""
                 raise UserError(explain(error) + where) from error
+
+
+def _composed(config_name: str, job: Sequence[str], paths: Sequence[str]) -> DictConfig:
+    """The configuration of a job; where there is none, and a name is not known, say which are."""
+    try:
+        return compose(config_name, list(job))
+    except CONFIGURATION_ERRORS:
+        groups = GlobalHydra.instance().config_loader().list_groups("")
+        plain = compose(config_name, list(paths))
+        _raise_first(unknown_setting(o, plain, groups) for o in job if "." not in o.partition("=")[0])
+        defaults = compose(config_name, [*paths, *(o for o in job if _chooses_group(o))])
+        _raise_first(unknown_setting(override, defaults, groups) for override in job)
+        raise
 
 
 def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
@@ -109,13 +118,27 @@ def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
         name, equals, value = argument.partition("=")
         if name in ("--config-dir", "-cd"):
             folder = Path(value if equals else next(left, "")).absolute()
-            overrides.append(f"{_SEARCH_PATH}['file://{folder}']")
+            overrides.append(_searching(f"file://{folder}"))
         elif argument.startswith("-"):
             flags.add(argument)
         else:
             overrides.append(argument)
     one_path = sum(override.startswith(_SEARCH_PATH) for override in overrides) <= 1
     return overrides if flags <= MULTIRUN_FLAGS and one_path else None
+
+
+def search_path(settings: HydraConf) -> list[str]:
+    """Where a run looks for groups besides our own, by ``--config-dir`` or ``hydra.searchpath``, as an override.
+
+    Args:
+        settings: Hydra's, of a run.
+    """
+    sources = [source for source in settings.runtime.config_sources if "command-line" in source.provider]
+    return [_searching(*(f"{source.schema}://{source.path}" for source in sources))] if sources else []
+
+
+def _searching(*places: str) -> str:
+    return f"{_SEARCH_PATH}{list(places)}"
 
 
 def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:

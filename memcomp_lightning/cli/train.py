@@ -21,7 +21,7 @@ from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
 from memcomp_lightning.cli.hydra_versions import MAIN
-from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun
+from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun, search_path
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
@@ -46,7 +46,7 @@ def train(config: DictConfig) -> float | None:
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
-        return _train(config, folder, list(settings.overrides.task))
+        return _train(config, folder, [*search_path(settings), *settings.overrides.task])
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(COMMAND, error)
@@ -132,7 +132,7 @@ def _is_first_process() -> bool:
 
 
 def _by_name(overrides: list[str]) -> dict[str, str]:
-    pairs = (override.partition("=") for override in overrides)
+    pairs = (override.partition("=") for override in overrides if not override.startswith("hydra."))
     return {name: value for name, _, value in pairs}
 
 

@@ -9,12 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pytest
 import torch
 from running import Outcome
 from test_command_line import options
 
-from memcomp_lightning.cli import report
+from memcomp_lightning.cli import figures, report
 from memcomp_lightning.report import Records
 
 Run = Callable[..., Outcome]
@@ -74,6 +75,23 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         assert record.scores["test_accuracy"][1] == pytest.approx(result["test_accuracy"], abs=1e-9)
         (other,) = [r for r in found.of(name) if (r.iterations, r.seed) == (1, 5)]
         assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
+
+
+@pytest.mark.parametrize("place", ["--config-dir=confs", "hydra.searchpath=['file://confs']"])
+def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, place: str) -> None:
+    """Beside one that has no solver, whose settings are common; it goes on without being told the place again."""
+    (tmp_path / "confs/sampler").mkdir(parents=True)
+    (tmp_path / "confs/sampler/mine.yaml").write_text("_target_: memcomp_lightning.samplers.CD\nk: 3\n")
+    curve = "+figure.curves.mine={label: mine, overrides: ['sampler=mine', 'solver=alternating_descent']}"
+    figure = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[2]", curve, "hydra.run.dir=run"]
+    outcome = memcomp_train(place, *figure)
+    assert outcome.status == 0, outcome.err
+    losses = only(records(), "mine", 2).scores["test_loss"]
+    assert losses != only(records(), "cd1", 2).scores["test_loss"]
+    Path("run/records.jsonl").unlink()
+    outcome = memcomp_train("resume=run")
+    assert outcome.status == 0, outcome.err
+    assert only(records(), "mine", 2).scores["test_loss"] == losses
 
 
 @pytest.mark.parametrize("sampler", ["cd", "pcd", "dmm_qubo"])
@@ -233,10 +251,27 @@ def test_results_of_other_code_or_settings_are_not_mixed(memcomp_train: Run) -> 
 def test_wrong_settings_of_a_figure_are_refused_before_training(
     memcomp_train: Run, override: str, message: str
 ) -> None:
-    outcome = memcomp_train("experiment=figure4", *SMALL, override, "hydra.run.dir=run")
+    outcome = memcomp_train("experiment=figure4", *SMALL, NO_CONTROLS, override, "hydra.run.dir=run")
     assert outcome.status != 0
     assert message in outcome.err
     assert not Path("run/records.jsonl").exists()
+
+
+def test_a_curve_is_composed_once(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not for the check and for the training: it takes a third of a second."""
+    composed = []
+
+    def counted(name: str, overrides: list[str]) -> Any:
+        composed.append(tuple(overrides))
+        return hydra.compose(name, overrides)
+
+    monkeypatch.setattr(figures, "compose", counted)
+    figures._composed.cache_clear()
+    outcome = memcomp_train(
+        "experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"
+    )
+    assert outcome.status == 0, outcome.err
+    assert len(set(composed)) == len(composed) == 3  # two curves, and the data
 
 
 TINY = [
