@@ -9,6 +9,8 @@ BIN := $(VENV)/bin
 train: $(VENV)/.installed
 	$(BIN)/memcomp-train data=digits sampler=dmm_qubo
 
+# A thread a worker.
+test: export OMP_NUM_THREADS = 1
 test: $(VENV)/.installed-dev lint
 	$(BIN)/pytest
 
