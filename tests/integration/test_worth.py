@@ -40,6 +40,18 @@ SMALL = [
 ]
 
 
+def test_a_sampler_of_ones_own_is_a_method(memcomp_train: Run, tmp_path: Path) -> None:
+    (tmp_path / "confs/sampler").mkdir(parents=True)
+    (tmp_path / "confs/sampler/mine.yaml").write_text("_target_: memcomp_lightning.samplers.CD\nk: 3\n")
+    own = "+worth.methods.mine={label: mine, overrides: ['sampler=mine'], rates: [0.5]}"
+    settings = [o for o in SMALL if not o.startswith(("worth.claimed", "+worth"))]
+    methods = ["+worth.data_sets.shifting_bars.methods=[cd1,mine]", "worth.claimed=[mine]"]
+    outcome = memcomp_train("--config-dir=confs", *settings, own, *methods)
+    assert outcome.status == 0, outcome.err
+    assert "mine beats CD-1" in outcome.out
+    assert {course.method for course in Courses(Path("run")).all} == {"cd1", "mine"}
+
+
 def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -> None:
     outcome = memcomp_train(*SMALL)
     assert outcome.status == 0, outcome.err
