@@ -10,7 +10,7 @@ from memcomp_lightning.report.worth import Worth
 
 
 def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: float = 4.6) -> Figure:
-    """Panels of one data set: score against updates and against seconds, cosine with the exact gradient.
+    """Panels of one data set: score against updates, against seconds, and, if known, cosine with the exact gradient.
 
     Lines are medians over replicas, each method at its best learning rate; the dotted line of a judged method is
     its worst replica.
@@ -22,10 +22,13 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
         height: Inches.
     """
     figure = Figure(figsize=(width, height), layout="constrained")
-    by_update, by_time, bias = figure.subplots(1, 3)
+    courses = {method: worth.best(data_set, method) for method in worth.methods(data_set)}
+    has_bias = any(np.isfinite(worth.values(course, "cosines")).any() for course in courses.values())
+    panels = figure.subplots(1, 3 if has_bias else 2)
+    by_update, by_time = panels[:2]
     settings = worth.plan["data_sets"][data_set]
-    for number, method in enumerate(worth.methods(data_set)):
-        course, scores = worth.best(data_set, method), worth.values(worth.best(data_set, method))
+    for number, (method, course) in enumerate(courses.items()):
+        scores = worth.values(course)
         claimed = method in worth.plan["claimed"]
         line = "-" if claimed else ("--", "-.")[number // 10 % 2]
         style = {"color": f"C{number % 10}", "ls": line, "lw": 1.6 if claimed else 1.0}
@@ -37,15 +40,16 @@ def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: floa
                 axes.plot(x, worst, color=style["color"], ls=":", lw=0.8)
         cosines = worth.values(course, "cosines")
         if np.isfinite(cosines).any():
-            bias.plot(course.updates, np.nanmedian(cosines, axis=1), **style)
+            panels[2].plot(course.updates, np.nanmedian(cosines, axis=1), **style)
     measure = "KL divergence of the data, nats" if settings["measure"] == "kl" else "negative log-likelihood, nats"
     by_update.set(xlabel="updates", ylabel=measure, xscale="log")
     by_time.set(xlabel="seconds of all replicas on one thread", xscale="log")
-    bias.set(xlabel="updates", ylabel="cosine of the mean gradient with the exact one", xscale="log")
+    for axes in panels[2:]:
+        axes.set(xlabel="updates", ylabel="cosine of the mean gradient with the exact one", xscale="log")
     for axes in (by_update, by_time):
         if _finite_range(axes) and settings["measure"] == "kl":
             axes.set_yscale("log")
-    for axes in (by_update, by_time, bias):
+    for axes in panels:
         axes.grid(alpha=0.25)
         axes.tick_params(labelsize=8)
     handles, labels = by_update.get_legend_handles_labels()
