@@ -10,7 +10,7 @@ from memcomp_lightning.report.worth import Worth
 
 
 def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: float = 4.6) -> Figure:
-    """Panels of one data set: score against updates, against seconds, and, if known, cosine with the exact gradient.
+    """Panels of one data set: score against updates and seconds, and, if known, cosine with the exact gradient.
 
     Lines are medians over replicas, each method at its best learning rate; the dotted line of a judged method is
     its worst replica.
