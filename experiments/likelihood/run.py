@@ -63,7 +63,8 @@ def start(rbm: RBM, images: ImageData, given: argparse.Namespace, *, centred: bo
 def trained(images: ImageData, given: argparse.Namespace, centring: Centring | None) -> tuple[RBM, float]:
     """An RBM after all passes of PCD-1, and the seconds."""
     published = PUBLISHED[given.hidden]
-    dbn = DBN(784, [given.hidden], weight_init=published.weights, generator=rng.stream(given.seed, "weights"))
+    weights = published.weights if given.weight_std is None else Gaussian(std=given.weight_std)
+    dbn = DBN(784, [given.hidden], weight_init=weights, generator=rng.stream(given.seed, "weights"))
     start(dbn[0], images, given, centred=centring is not None)
     batches = Batches(
         images.train_v,
@@ -133,6 +134,7 @@ def main() -> None:
     parser.add_argument(
         "--visible-bias", choices=("data", "zero"), default="data", help="first: log odds of the data, or 0"
     )
+    parser.add_argument("--weight-std", type=float, help="first weights N(0, std^2), not the published ones")
     parser.add_argument("--only", choices=tuple(CASES))
     parser.add_argument("--chains", type=int, default=100, help="of AIS")
     parser.add_argument("--betas", type=int, default=10_000, help="of AIS")
@@ -148,7 +150,7 @@ def main() -> None:
             rbm, seconds = trained(images, given, centring)
             settings = {
                 "case": name,
-                **{k: getattr(given, k) for k in ("hidden", "passes", "visible_bias", "seed")},
+                **{k: getattr(given, k) for k in ("hidden", "passes", "weight_std", "visible_bias", "seed")},
             }
             found = {**settings, "seconds": round(seconds, 1)}
             line = json.dumps({**found, **measured(rbm, images, given)})
