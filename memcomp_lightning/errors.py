@@ -1,6 +1,7 @@
 """How a setting is refused: name, value, what is allowed, what to do."""
 
 from collections.abc import Collection
+from numbers import Integral
 
 
 class SettingError(ValueError):
@@ -29,10 +30,23 @@ def require(condition: bool, name: str, value: object, allowed: str, remedy: str
 
 def require_count(name: str, value: object, minimum: int = 1) -> None:
     """Raise unless ``value`` is an integer of at least ``minimum``."""
-    valid = isinstance(value, int) and not isinstance(value, bool) and value >= minimum
+    valid = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
     require(valid, name, value, f"an integer >= {minimum}")
 
 
 def require_choice(name: str, value: object, allowed: Collection[str]) -> None:
     """Raise unless ``value`` is one of ``allowed``."""
     require(value in allowed, name, value, "one of " + ", ".join(repr(option) for option in allowed))
+
+
+def require_parts(name: str, value: object, kind: str, parts: Collection[str]) -> None:
+    """Raise unless ``value`` has the methods and attributes that a protocol asks for.
+
+    >>> require_parts("solver", 3, "solver", ["minimise"])
+    Traceback (most recent call last):
+    memcomp_lightning.errors.SettingError: solver = 'int' is not allowed: expected a solver, which has minimise.
+    """
+    given = value if isinstance(value, str) else getattr(value, "__name__", type(value).__name__)
+    missing = [part for part in parts if not hasattr(value, part)]
+    complete = not missing and not isinstance(value, type)
+    require(complete, name, given, f"a {kind}, which has {', '.join(missing) or 'settings: an object, no class'}")

@@ -51,7 +51,7 @@ class Pictures(EveryIterations):
             return
         tiles = self.tiles(pl_module, outputs)
         first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
-        grid = picture_grid(layout.to_picture(first_replica).cpu().numpy())
+        grid = picture_grid(layout.to_picture(first_replica).float().cpu().numpy())
         for board in boards:
             tag = f"{prefix_of(pl_module)}/{self.tag}"
             board.add_image(tag, grid, trainer.global_step, dataformats="HW")

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser
 from memcomp_lightning.modules import (
     BoltzmannPretraining,
@@ -102,7 +102,10 @@ def build(config: DictConfig) -> Plan:
     check_finite(config)
     seed = config.seed
     check_seed(seed)
-    images = _load(instantiate(config.data.source))
+    precision = str(config.trainer.precision)
+    allowed = "32-true, 64-true, 16-true or bf16-true: the stages step by themselves, and mix none"
+    require("mixed" not in precision and "transformer" not in precision, "trainer.precision", precision, allowed)
+    images = _loaded(instantiate(config.data.source))
     network = _network(config, images)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
@@ -256,7 +259,11 @@ def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> 
 
 
 def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
-    return [instantiate(callback) for callback in given(config.callbacks[stage])]
+    callbacks = [instantiate(callback) for callback in given(config.callbacks[stage] or {})]
+    for callback in callbacks:
+        kind = type(callback).__name__
+        require(isinstance(callback, pl.Callback), f"callbacks.{stage}", kind, "callbacks of Lightning")
+    return callbacks
 
 
 def given(callbacks: Mapping[Any, Any]) -> list[Any]:
@@ -265,6 +272,15 @@ def given(callbacks: Mapping[Any, Any]) -> list[Any]:
 
 
 _PRECISIONS = {"64-true": torch.float64, "16-true": torch.float16, "bf16-true": torch.bfloat16}
+
+
+def _loaded(source: ImageSource) -> ImageData:
+    require_parts("data.source", source, "source of images", ("load",))
+    images = _load(source) if isinstance(source, Hashable) else source.load()
+    require(
+        isinstance(images, ImageData), "data.source", type(images).__name__, "a load() that returns an ImageData"
+    )
+    return images
 
 
 @lru_cache(maxsize=1)

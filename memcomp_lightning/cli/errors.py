@@ -3,11 +3,13 @@
 import difflib
 import sys
 from collections.abc import Collection
+from importlib.util import find_spec
 from typing import NoReturn
 
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 
 class UserError(Exception):
@@ -22,6 +24,7 @@ CONFIGURATION_ERRORS = (
     ImportError,
     HydraException,
     OmegaConfBaseException,
+    YAMLError,
 )
 """What building a run may raise on account of its settings; the package's own errors are ValueErrors."""
 
@@ -45,7 +48,7 @@ def explain(error: BaseException) -> str:
         cause = error.__cause__
         while cause is not None and cause.__cause__ is not None:
             cause = cause.__cause__
-        text = str(cause) if cause is not None else str(error).splitlines()[0]
+        text = _of_import(cause) or (str(cause) if cause is not None else str(error).splitlines()[0])
         return f"{setting}: {text}" if setting else text
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
@@ -58,8 +61,21 @@ def explain(error: BaseException) -> str:
         text, _, _ = str(error).partition("\nConfig search path:")
         reason = "" if error.__cause__ is None else str(error.__cause__).splitlines()[0]
         return " ".join([*text.split(), reason]).rstrip()
+    if isinstance(error, YAMLError):
+        return f"a configuration file is no YAML: {' '.join(str(error).split())}"
     setting = _full_key(*getattr(error, "__notes__", ()))  # Hydra 1.4 does not wrap what a target raises
-    return f"{setting}: {error}" if setting else str(error)
+    text = _of_import(error) or str(error)
+    return f"{setting}: {text}" if setting else text
+
+
+def _of_import(error: BaseException | None) -> str:
+    """What to do about a module or a class that is not found; nothing if that is not the error."""
+    if not isinstance(error, ModuleNotFoundError) or error.name is None or "pip install" in str(error):
+        return ""
+    module, _, leaf = error.name.rpartition(".")
+    if module and find_spec(module.partition(".")[0]) is not None:
+        return f"{module} has no {leaf}."
+    return f"no module {error.name}: install it, or put the folder that holds its file on PYTHONPATH."
 
 
 def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str] = ()) -> str | None:

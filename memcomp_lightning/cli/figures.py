@@ -9,7 +9,7 @@ from typing import Any
 
 from hydra import compose
 from hydra.errors import ConfigCompositionException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from memcomp_lightning.cli.build import build, given
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
@@ -19,7 +19,7 @@ from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.report import Plan, Records
 
-_SET_BY_FIGURE = ("pretrain.iterations", "finetune.iterations", "seed")
+_SET_BY_FIGURE = {"pretrain.iterations": "iterations", "finetune.iterations": "passes", "seed": "seeds"}
 CURVE_SETTINGS = ("label", "overrides", "iterations")
 
 
@@ -85,10 +85,21 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         UserError, SettingError, InstantiationException: As ``build``.
     """
-    Plan.of(_shown(config, overrides))
+    for override in overrides:
+        setting, _, value = override.lstrip("+").partition("=")
+        instead = _SET_BY_FIGURE.get(setting)
+        require(instead is None, setting, value, "nothing in a figure", f"It has figure.{instead}.")
+        remedy = "+figure.curves.mine={label: mine, overrides: ['sampler=" + value + "']} adds it."
+        require(setting != "sampler", setting, value, "nothing in a figure, where each curve has its own", remedy)
+    for name in ("passes", "iterations", "seeds"):
+        _require_list(f"figure.{name}", config.figure[name])
     for name, curve in config.figure.curves.items():
         for key in curve:
             require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)
+        for key in ("label", "overrides"):
+            require(key in curve, f"figure.curves.{name}.{key}", None, "a setting of each curve")
+        _require_list(f"figure.curves.{name}.iterations", curve.get("iterations", [1]))
+    Plan.of(_shown(config, overrides))
     for name, settings in _curves(config, overrides).items():
         values = tried_values(settings)
         if values:
@@ -97,6 +108,11 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
             require(chosen not in _SET_BY_FIGURE, f"choose.setting of figure.curves.{name}", chosen, allowed)
         for own in [for_trial(settings, value) for value in values] or [settings]:
             build(own)
+
+
+def _require_list(name: str, values: Any) -> None:
+    fits = isinstance(values, ListConfig | list) and len(values) > 0
+    require(fits, name, values, "a list of numbers, at least one: [1, 5]")
 
 
 def plan_units(

@@ -4,6 +4,7 @@ import hashlib
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,7 @@ def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
         name, equals, value = argument.partition("=")
         if name in ("--config-dir", "-cd"):
             folder = Path(value if equals else next(left, "")).absolute()
+            _check_groups(folder)
             overrides.append(_searching(f"file://{folder}"))
         elif argument.startswith("-"):
             flags.add(argument)
@@ -125,6 +127,18 @@ def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
             overrides.append(argument)
     one_path = sum(override.startswith(_SEARCH_PATH) for override in overrides) <= 1
     return overrides if flags <= MULTIRUN_FLAGS and one_path else None
+
+
+def _check_groups(folder: Path) -> None:
+    """Raise unless a folder of configurations is there, with names of its own."""
+    if not folder.is_dir():
+        raise UserError(f"--config-dir {folder}: there is no such folder.")
+    ours = Path(str(files(CONFIG_MODULE)))
+    for path in sorted(folder.glob("*/**/*.yaml")):
+        if (ours / path.relative_to(folder)).exists():
+            raise UserError(
+                f"{path} would not be used: memcomp_lightning has a file of this name. Give it another."
+            )
 
 
 def search_path(settings: HydraConf) -> list[str]:

@@ -15,8 +15,10 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
+from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
+from memcomp_lightning.cli.table import short_path
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import (
@@ -51,7 +53,7 @@ def run(
     is_global_zero = True
     for stage in plan.stages:
         name = stage.module.stage
-        if name in done:
+        if name in done and folder.weights(name).exists():
             load_weights(_trained(stage), folder.weights(name))
             records[name] = done[name]
             if stage is plan.pretraining:
@@ -156,9 +158,12 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
         log.info("Going on from %s", path)
     trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
     if trainer.current_epoch < stage.module.n_epochs and not config.trainer.fast_dev_run:
-        raise RuntimeError(
-            f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes (a "
-            "limit of the trainer, or a callback): its weights are not recorded as trained."
+        raise UserError(
+            f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes, by a "
+            "limit of the trainer or a callback: its weights are not recorded as trained. Give it fewer passes "
+            f"({stage.module.stage}.iterations), or lift the limit and go on with "
+            f"resume={short_path(folder.path)}, from the last checkpoint "
+            f"(checkpoint_every={config.checkpoint_every})."
         )
     return trainer
 

@@ -109,6 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_text(output, page(sections))
     except (UserError, SettingError) as error:
         refuse(COMMAND, error)
+    except OSError as error:
+        refuse(COMMAND, UserError(f"{error.filename} cannot be read or written ({error.strerror})."))
     for section in sections:
         if section.verdicts:
             print(f"\n{section.title}\n{verdict_table(section.verdicts)}")

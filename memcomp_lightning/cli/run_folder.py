@@ -35,6 +35,11 @@ class RunFolder:
         return self._read("error.json")
 
     @property
+    def report(self) -> Path:
+        """The page that a figure or a comparison ends with."""
+        return self.path / "report.html"
+
+    @property
     def finished_stages(self) -> dict[str, Any]:
         """Records of the stages that are done, by name."""
         return self._read("stages.json") or {}
@@ -99,12 +104,16 @@ class RunFolder:
         """Write the result, with what produced it."""
         origin = {"memcomp_lightning": __version__, **_machine()}
         self._write("result.json", {**result, "origin": origin})
-        (self.path / "error.json").unlink(missing_ok=True)
+        self.forget_error()
 
     def fail(self, record: dict[str, Any]) -> None:
         """Write why the run failed."""
         self.path.mkdir(parents=True, exist_ok=True)
         self._write("error.json", record)
+
+    def forget_error(self) -> None:
+        """Note that the last attempt did not fail."""
+        (self.path / "error.json").unlink(missing_ok=True)
 
     def _check_same(self, path: Path, config: DictConfig) -> None:
         there, now = _flat(OmegaConf.load(path)), _flat(config)
@@ -118,8 +127,12 @@ class RunFolder:
     def _read(self, name: str) -> dict[str, Any] | None:
         try:
             content: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
+        except ValueError as error:
+            raise UserError(
+                f"{self.path / name} is damaged ({error}): restore it, or choose another folder."
+            ) from None
         return content
 
     def _write(self, name: str, content: dict[str, Any]) -> None:

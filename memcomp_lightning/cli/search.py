@@ -5,6 +5,7 @@ from importlib.metadata import version
 
 from hydra import compose
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
@@ -74,7 +75,8 @@ def _check_storage(storage: object) -> None:
 
 
 def _parsed(overrides: Sequence[str]) -> list[Override]:
-    return OverridesParser.create().parse_overrides(list(overrides))
+    loader = GlobalHydra.instance().config_loader()  # for glob(...), which lists options
+    return OverridesParser.create(config_loader=loader).parse_overrides(list(overrides))
 
 
 def _values(override: Override) -> list[str]:

@@ -10,7 +10,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import aligned, mean_and_error, with_error
+from memcomp_lightning.cli.table import aligned, mean_and_error, short_path, with_error
 from memcomp_lightning.files import write_text
 
 
@@ -28,22 +28,27 @@ def merge(folder: Path) -> tuple[str, int]:
     """Merge the jobs of a sweep folder into one table and write it as ``table.csv``.
 
     Rows are settings; mean and standard error are over seeds and replicas. Settings that all jobs share
-    are left out.
+    are left out. Of figures and comparisons the reports are listed.
 
     Returns:
         The table with the failed jobs below it, and the number of these.
     """
     groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]] = defaultdict(list)
     failed: list[tuple[str, str]] = []
+    reports: list[Path] = []
     # Launchers keep their own files in folders such as .submitit.
     jobs = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     for path in sorted(jobs):
         job = RunFolder(path)
-        if (result := job.result) is not None:
+        if job.report.exists() and job.error is None:
+            reports.append(job.report)
+        elif (result := job.result) is not None:
             groups[tuple((k, v) for k, v in result["overrides"].items() if k != "seed")].append(result)
         else:
             failed.append((path.name, (job.error or {"error": "did not finish"})["error"]))
-    text = _table(groups, folder) if groups else "No job has finished."
+    text = _table(groups, folder) if groups else ""
+    text += "".join(f"Report:  {short_path(path)}\n" for path in reports)
+    text = text or "No job has finished."
     if failed:
         listing = "\n".join(f"  {name}\n    {error}" for name, error in failed)
         text += f"\n\n{len(failed)} failed; start the same sweep again to repeat only these:\n{listing}"

@@ -63,6 +63,10 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
         worth.check(config, overrides)
         return
     if config.figure is not None:
+        if not {"name", "all"} & set(config.figure):
+            raise UserError(
+                "preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick."
+            )
         for part, own in figures.parts(config, overrides).values():
             check = trajectory.prepare if "curves" not in part.figure else figures.check
             check(part, own)
@@ -113,17 +117,18 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     try:
         if config.worth is not None:
             worth.train_worth(config, overrides, folder.path)
-            report.main([str(folder.path)])
-            return
-        trained = []
-        for name, (part, own) in figures.parts(config, overrides).items():
-            trained.append(folder.path / name)
-            trained[-1].mkdir(exist_ok=True)
-            train = trajectory.train_trajectory if "curves" not in part.figure else figures.train_curves
-            train(part, own, trained[-1])
-        report.main([*map(str, trained), "--output", str(folder.path / "report.html")])
-    except (KeyboardInterrupt, SystemExit) as stop:
+            trained = [folder.path]
+        else:
+            trained = []
+            for name, (part, own) in figures.parts(config, overrides).items():
+                trained.append(folder.path / name)
+                trained[-1].mkdir(exist_ok=True)
+                train = trajectory.train_trajectory if "curves" not in part.figure else figures.train_curves
+                train(part, own, trained[-1])
+        report.main([*map(str, trained), "--output", str(folder.report)])
+    except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
+    folder.forget_error()
 
 
 def _is_first_process() -> bool:

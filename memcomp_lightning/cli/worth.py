@@ -36,10 +36,19 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for key in ("replicas", "choosing", "points", "gradient_draws"):
         require_count(f"worth.{key}", worth[key])
     require(len(worth.rates) > 0, "worth.rates", list(worth.rates), "at least one learning rate")
+    for override in overrides:
+        name, _, value = override.lstrip("+").partition("=")
+        own = {"pretrain.iterations": "passes of its data sets", "sampler": "methods"}.get(name)
+        require(own is None, name, value, "nothing in a comparison", f"It has {own}.")
+    require(worth.only is None or len(worth.only) > 0, "worth.only", [], "names of data sets, or null for all")
     for kind, known in (("data_sets", DATA_SETTINGS), ("methods", METHOD_SETTINGS)):
         for name, settings in worth[kind].items():
             for key in settings:
                 require_choice(f"setting of worth.{kind}.{name}", str(key), known)
+            for key in ("label", "overrides"):
+                require(key in settings, f"worth.{kind}.{name}.{key}", None, "a setting of each")
+            longer = settings.get("longer", 1)
+            require(longer > 0, f"worth.{kind}.{name}.longer", longer, "a number > 0")
             for key in ("methods", "rates"):
                 found = settings.get(key, ["one"])
                 require(len(found) > 0, f"worth.{kind}.{name}.{key}", list(found), "at least one, or leave it out")

@@ -20,7 +20,7 @@ from memcomp_lightning.dmm.clause import ClauseField
 from memcomp_lightning.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.dmm.kernels import reference
 from memcomp_lightning.dmm.kernels.run import Run, Stall, Start
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_choice, require_count, require_parts
 from memcomp_lightning.qubo.graph import Bipartite, EdgeList
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, Status, Trajectory
@@ -88,6 +88,8 @@ class DmmSolver:
     kernel: Literal["auto", "compiled", "reference"] = "auto"
 
     def __post_init__(self) -> None:
+        parts = ("integrator", "noise", "spread", "build", "stability", "init", "derivative", "bound")
+        require_parts("field", self.field, "vector field", parts)
         require_count("n_restarts", self.n_restarts)
         for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
             if getattr(self, name) is not None:

@@ -13,6 +13,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
 from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
+from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.types import Batch, Configurations, NegativePhase
 
 
@@ -43,6 +44,7 @@ class EnergyPretraining(StageModule):
         seed: int,
     ) -> None:
         require_count("pretrain.iterations", iterations)
+        require_sampler("sampler", sampler)
         super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
         self.sampler = sampler
         self.centring = centring

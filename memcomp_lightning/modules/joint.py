@@ -14,6 +14,7 @@ from memcomp_lightning.modules.energy import EnergyPretraining
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import MeanField, NegativePhaseSampler, PositivePhase, PositivePhaseSampler
+from memcomp_lightning.samplers.base import require_state
 from memcomp_lightning.types import Batch
 
 
@@ -49,7 +50,7 @@ class BoltzmannPretraining(EnergyPretraining):
         seed: int = 0,
     ) -> None:
         super().__init__(sampler, iterations=iterations, optimizer=optimizer, centring=centring, seed=seed)
-        sampler.init(model, 1, generator=rng.stream(seed, "check"))
+        require_state(sampler.init(model, 1, generator=rng.stream(seed, "check")))
         self.model = model
         self.positive = MeanField() if positive is None else positive
 

@@ -13,6 +13,7 @@ from memcomp_lightning.modules.energy import EnergyPretraining
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, positive_phase
+from memcomp_lightning.samplers.base import require_state
 from memcomp_lightning.types import Batch
 
 
@@ -47,7 +48,7 @@ class DBNPretraining(EnergyPretraining):
     ) -> None:
         super().__init__(sampler, iterations=iterations, optimizer=optimizer, centring=centring, seed=seed)
         for rbm in dbn:
-            sampler.init(rbm, 1, generator=rng.stream(seed, "check"))
+            require_state(sampler.init(rbm, 1, generator=rng.stream(seed, "check")))
         self.dbn = dbn
 
     @property

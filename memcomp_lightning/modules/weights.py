@@ -50,8 +50,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except Exception as error:  # torch raises half a dozen kinds for damaged files
         raise CheckpointError(
             f"checkpoint {path} ({path.stat().st_size} bytes) is truncated or damaged, or holds more than tensors "
-            "and plain values, and code in checkpoints is never executed. Delete it to train that stage again, or "
-            f"use a file that memcomp-train wrote. ({type(error).__name__}: {str(error).partition(chr(10))[0]})"
+            "and plain values, and code in checkpoints is never executed. In a run folder, delete it to train "
+            "that stage again; elsewhere, use a file that memcomp-train wrote. "
+            f"({type(error).__name__}: {str(error).partition(chr(10))[0]})"
         ) from error
     if not isinstance(content, dict):
         raise CheckpointError(f"checkpoint {path} holds a {type(content).__name__}, expected a dictionary.")

@@ -5,6 +5,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 from torch import Generator, Tensor
 
+from memcomp_lightning.errors import require, require_parts
 from memcomp_lightning.types import Configurations, NegativePhase
 
 ModelT = TypeVar("ModelT", contravariant=True)
@@ -18,6 +19,7 @@ def tensors_of(state: Any) -> dict[str, Tensor]:
     >>> tensors_of(NoState())
     {}
     """
+    require_state(state)
     found: dict[str, Tensor] = {}
     for name, value in state._asdict().items():
         if isinstance(value, Tensor):
@@ -37,6 +39,18 @@ def with_tensors(state: StateT, tensors: Mapping[str, Tensor]) -> StateT:
             inner = {key.removeprefix(f"{name}."): t for key, t in tensors.items() if key.startswith(f"{name}.")}
             values[name] = with_tensors(value, inner)
     return type(state)(**values)
+
+
+def require_sampler(name: str, sampler: object) -> None:
+    """Raise unless an object has what :class:`NegativePhaseSampler` asks for."""
+    require_parts(name, sampler, "sampler of the negative phase", ("init", "sample", "uses_data", "shared"))
+
+
+def require_state(state: object) -> None:
+    """Raise unless a sampler's state can be kept in a checkpoint."""
+    kept = isinstance(state, tuple) and hasattr(state, "_asdict")
+    allowed = "a NamedTuple of tensors, or NoState()"
+    require(kept, "state of the sampler", type(state).__name__, allowed, "Checkpoints keep it by names.")
 
 
 class NegativePhaseSampler(Protocol[ModelT, StateT]):

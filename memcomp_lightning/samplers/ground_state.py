@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.errors import require, require_choice, require_parts
 from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.qubo.from_model import from_model
@@ -33,6 +33,7 @@ class GroundState:
 
     def __post_init__(self) -> None:
         require_choice("readout", self.readout, ("best", "time_average"))
+        require_parts("solver", self.solver, "solver of QUBOs", ("minimise",))
         if self.readout == "time_average":
             require(
                 getattr(self.solver, "record", None) is not None,

@@ -11,7 +11,7 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.objective import shares
-from memcomp_lightning.samplers.base import NegativePhaseSampler
+from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
 from memcomp_lightning.samplers.tempering import TemperedModel
 from memcomp_lightning.types import Configurations, NegativePhase
 
@@ -92,6 +92,10 @@ class ModeAssisted:
     inner: NegativePhaseSampler[Any, Any]
     mode: NegativePhaseSampler[Any, Any]
     schedule: ModeSchedule
+
+    def __post_init__(self) -> None:
+        require_sampler("inner", self.inner)
+        require_sampler("mode", self.mode)
 
     def init(self, model: SizedModel, n_chains: int, *, generator: Generator) -> ModeAssistedState:
         """Start both samplers."""

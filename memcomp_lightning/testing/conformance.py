@@ -13,6 +13,7 @@ from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of
+from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.types import Configurations
 
 ModelT = TypeVar("ModelT", RBM, DBM, BoltzmannMachine)
@@ -67,8 +68,10 @@ def check_sampler(
 
     Raises:
         AssertionError: Naming what the sampler got wrong.
+        SettingError: It lacks a part of a sampler, or its state is no NamedTuple.
     """
     name = type(sampler).__name__
+    require_sampler("sampler", sampler)
     _check_frozen(sampler)
     for replicas in ((), (3,), (2, 3)):
         rbm = make(replicas=replicas)

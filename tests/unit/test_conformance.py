@@ -8,7 +8,9 @@ import torch
 
 from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.modules import DBNPretraining
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, Qubo
 from memcomp_lightning.samplers import (
     CD,
@@ -209,10 +211,29 @@ def test_kit_refuses_settings_that_can_be_changed():
         k: int = 1
         init = PCD.init
         sample = PCD.sample
-        n_chains = None
+        uses_data, shared, n_chains = False, False, None
 
     with pytest.raises(AssertionError, match=r"^Thawed: the setting 'k' can be changed; freeze the class"):
         check_sampler(Thawed())
+
+
+def test_kit_refuses_what_is_no_sampler_and_states_that_no_checkpoint_keeps():
+    with pytest.raises(SettingError, match=r"sampler = 'PCD' is not allowed: expected .* an object, no class"):
+        check_sampler(PCD)
+
+    class Forgetful:
+        uses_data, shared = True, False
+
+        def init(self, model, n_chains, *, generator):
+            return {"chain": torch.zeros(3)}
+
+        def sample(self, model, state, positive, *, generator):
+            return NegativePhase(positive, state, {})
+
+    with pytest.raises(SettingError, match="state of the sampler = 'dict' is not allowed: expected a NamedTuple"):
+        check_sampler(Forgetful())
+    with pytest.raises(SettingError, match="state of the sampler = 'dict'"):
+        DBNPretraining(DBN(4, [3]), Forgetful())
 
 
 # --- broken solvers ---------------------------------------------------------------------------------------

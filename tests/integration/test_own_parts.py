@@ -1,0 +1,115 @@
+"""What a user's own parts, files and lists may lack is named, in one line."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from running import FAST, Outcome
+
+Run = Callable[..., Outcome]
+FIGURE = ["experiment=figure4", "data=digits", "figure/curves=none", "hydra.run.dir=run"]
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        (
+            "_target_: mywarm.Warm",
+            "sampler: no module mywarm: install it, or put the folder that holds its file on",
+        ),
+        ("_target_: fractions.Warm", "sampler: fractions has no Warm."),
+        (
+            "_target_: builtins.object",
+            "sampler = 'object' is not allowed: expected a sampler of the negative phase",
+        ),
+        ("a: [b", "a configuration file is no YAML: while parsing"),
+    ],
+)
+def test_a_sampler_that_cannot_be_used(memcomp_train: Run, tmp_path: Path, written: str, message: str) -> None:
+    (tmp_path / "confs/sampler").mkdir(parents=True)
+    (tmp_path / "confs/sampler/warm.yaml").write_text(written)
+    outcome = memcomp_train("--config-dir=confs", "sampler=warm", *FAST)
+    assert outcome.status == 2
+    assert message in outcome.err
+
+
+def test_a_folder_of_configurations_is_there_and_has_names_of_its_own(memcomp_train: Run, tmp_path: Path) -> None:
+    outcome = memcomp_train("--config-dir", "confs", "sampler=cd")
+    assert outcome.err == f"memcomp-train: --config-dir {tmp_path}/confs: there is no such folder.\n"
+    (tmp_path / "confs/sampler").mkdir(parents=True)
+    (tmp_path / "confs/sampler/cd.yaml").write_text("_target_: mine.CD")
+    outcome = memcomp_train("--config-dir", "confs", "sampler=cd")
+    assert "confs/sampler/cd.yaml would not be used: memcomp_lightning has a file of this name" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sampler=dmm_qubo", "solver.field=bond"], "field = 'bond' is not allowed: expected a vector field"),
+        (
+            ["sampler=mode_assisted_cd", "sampler.inner=cd"],
+            "inner = 'cd' is not allowed: expected a sampler of the",
+        ),
+        (["trainer.precision=16-mixed"], "trainer.precision = '16-mixed' is not allowed: expected 32-true"),
+        (
+            ["preset=quick"],
+            "preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick.",
+        ),
+        ([*FIGURE, "seed=3"], "seed = '3' is not allowed: expected nothing in a figure. It has figure.seeds."),
+        (
+            [*FIGURE, "sampler=pcd"],
+            "each curve has its own. +figure.curves.mine={label: mine, overrides: ['sampler=pcd']}",
+        ),
+        ([*FIGURE, "figure.passes=[]"], "figure.passes = [] is not allowed: expected a list of numbers"),
+        ([*FIGURE, "figure.iterations=3"], "figure.iterations = 3 is not allowed: expected a list of numbers"),
+        ([*FIGURE, "+figure.curves.x={overrides: []}"], "figure.curves.x.label = None is not allowed"),
+        (["experiment=sampler_worth", "worth.only=[]"], "worth.only = [] is not allowed"),
+    ],
+)
+def test_settings_that_cannot_be_used(memcomp_train: Run, arguments: list[str], message: str) -> None:
+    outcome = memcomp_train(*arguments)
+    assert outcome.status == 2
+    assert message in outcome.err
+
+
+def test_a_limit_of_the_trainer_says_how_to_go_on(memcomp_train: Run) -> None:
+    outcome = memcomp_train("sampler=cd", *FAST, "+trainer.max_steps=1", "callbacks=minimal", "hydra.run.dir=run")
+    assert outcome.status == 2
+    assert "pretrain stopped after 1 of 4 passes" in outcome.err
+    assert "go on with resume=run, from the last checkpoint (checkpoint_every=10)." in outcome.err
+
+
+def test_a_missing_weight_file_is_trained_again_and_a_damaged_record_is_named(memcomp_train: Run) -> None:
+    run = ["sampler=cd", *FAST, "callbacks=minimal", "hydra.run.dir=run"]
+    assert memcomp_train(*run).status == 0
+    weights = Path("run/weights/pretrain.pt")
+    before = weights.read_bytes()
+    weights.unlink()
+    Path("run/result.json").unlink()
+    assert memcomp_train("resume=run").status == 0
+    assert len(weights.read_bytes()) == len(before)
+    Path("run/overrides.json").write_text("{")
+    outcome = memcomp_train("resume=run")
+    assert outcome.status == 2
+    assert "run/overrides.json is damaged" in outcome.err
+
+
+def test_a_multirun_of_figures_ends_with_its_reports(memcomp_train: Run) -> None:
+    small = [
+        "data.partitions=2",
+        "figure.passes=[1]",
+        "figure.iterations=[1]",
+        "figure.workers=1",
+        "solver.n_restarts=3",
+    ]
+    figures = [*FIGURE[:-1], *small, "solver.max_steps=20,30", "hydra.sweep.dir=sweep"]
+    outcome = memcomp_train("-m", *figures)
+    assert outcome.status == 0, outcome.err
+    assert outcome.out.count("/report.html") >= 2
+    assert "failed" not in outcome.out
+
+
+def test_options_of_a_group_by_pattern(memcomp_train: Run) -> None:
+    outcome = memcomp_train("-m", "sampler=glob(c*)", *FAST, "callbacks=minimal", "hydra.sweep.dir=sweep")
+    assert outcome.status == 0, outcome.err
+    assert Path("sweep/table.csv").exists()
