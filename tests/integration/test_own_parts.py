@@ -1,7 +1,9 @@
 """What a user's own parts, files and lists may lack is named, in one line."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 from running import FAST, Outcome
@@ -70,6 +72,23 @@ def test_settings_that_cannot_be_used(memcomp_train: Run, arguments: list[str], 
     outcome = memcomp_train(*arguments)
     assert outcome.status == 2
     assert message in outcome.err
+
+
+def test_images_of_ones_own_from_the_page(
+    memcomp_train: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+    (code,) = [
+        block for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "ImageData(" in block
+    ]
+    (config,) = re.findall(r"two_greys.yaml`:\n\n(.*?)\n\n##", page, flags=re.DOTALL)
+    (tmp_path / "your_package.py").write_text(code)
+    (tmp_path / "confs/data").mkdir(parents=True)
+    (tmp_path / "confs/data/two_greys.yaml").write_text(dedent(config))
+    monkeypatch.syspath_prepend(tmp_path)
+    outcome = memcomp_train("--config-dir=confs", "data=two_greys", "sampler=cd", *FAST, "callbacks=minimal")
+    assert outcome.status == 0, outcome.err
+    assert "test accuracy" in outcome.out
 
 
 def test_a_limit_of_the_trainer_says_how_to_go_on(memcomp_train: Run) -> None:
