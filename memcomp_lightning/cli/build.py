@@ -16,7 +16,7 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, MomentumSchedule
-from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.cli.errors import UserError, in_words
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
@@ -254,7 +254,7 @@ def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> 
             if isinstance(callback, MomentumSchedule):
                 callback.check(optimizer)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{stage}.optimizer: {error}") from error
+        raise UserError(f"{stage}.optimizer: {in_words(error)}") from error
     return factory
 
 

@@ -48,7 +48,7 @@ def explain(error: BaseException) -> str:
         cause = error.__cause__
         while cause is not None and cause.__cause__ is not None:
             cause = cause.__cause__
-        text = _of_import(cause) or (str(cause) if cause is not None else str(error).splitlines()[0])
+        text = in_words(cause) if cause is not None else str(error).splitlines()[0]
         return f"{setting}: {text}" if setting else text
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
@@ -64,14 +64,16 @@ def explain(error: BaseException) -> str:
     if isinstance(error, YAMLError):
         return f"a configuration file is no YAML: {' '.join(str(error).split())}"
     setting = _full_key(*getattr(error, "__notes__", ()))  # Hydra 1.4 does not wrap what a target raises
-    text = _of_import(error) or str(error)
+    text = in_words(error)
     return f"{setting}: {text}" if setting else text
 
 
-def _of_import(error: BaseException | None) -> str:
-    """What to do about a module or a class that is not found; nothing if that is not the error."""
+def in_words(error: BaseException) -> str:
+    """The message of an error; what it means where Python's own words say it to programmers alone."""
+    if isinstance(error, TypeError) and "not supported between instances of 'str'" in str(error):
+        return "text is given where a number is expected."
     if not isinstance(error, ModuleNotFoundError) or error.name is None or "pip install" in str(error):
-        return ""
+        return str(error)
     module, _, leaf = error.name.rpartition(".")
     if module and find_spec(module.partition(".")[0]) is not None:
         return f"{module} has no {leaf}."

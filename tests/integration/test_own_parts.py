@@ -47,6 +47,11 @@ def test_a_folder_of_configurations_is_there_and_has_names_of_its_own(memcomp_tr
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["pretrain.optimizer.lr=abc"], "pretrain.optimizer: text is given where a number is expected."),
+        (
+            ["data.source.pixels=threshold", "data.source.threshold=abc"],
+            "data.source: text is given where a number",
+        ),
         (["sampler=dmm_qubo", "solver.field=bond"], "field = 'bond' is not allowed: expected a vector field"),
         (
             ["sampler=mode_assisted_cd", "sampler.inner=cd"],
