@@ -70,7 +70,8 @@ def explain(error: BaseException) -> str:
 
 def in_words(error: BaseException) -> str:
     """The message of an error; what it means where Python's own words say it to programmers alone."""
-    if isinstance(error, TypeError) and "not supported between instances of 'str'" in str(error):
+    compared, _, kinds = str(error).partition(" not supported between instances of ")
+    if isinstance(error, TypeError) and compared and "'str'" in kinds:
         return "text is given where a number is expected."
     if not isinstance(error, ModuleNotFoundError) or error.name is None or "pip install" in str(error):
         return str(error)
