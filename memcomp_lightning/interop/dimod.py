@@ -26,8 +26,8 @@ except ModuleNotFoundError:
 SMALLEST_BETA = 0.01
 """Estimates stay above: what is asked of a stubborn annealer is finite."""
 
-MAX_NEWTON_STEPS = 100
-"""Of an estimate; six or so are made, and about fifty for states that are all local minima."""
+MAX_NEWTON_STEPS = 60
+"""Of an estimate; six or so are made."""
 
 
 def to_bqm(qubo: Qubo) -> BinaryQuadraticModel:
@@ -212,19 +212,27 @@ def maximum_pseudo_likelihood_beta(
     gain = (-(2 * x - 1) * field).double()
     low = torch.zeros(gain.shape[:-2], dtype=torch.float64, device=gain.device)
     high = torch.full_like(low, largest)
+    at_low, at_high = (_slope_and_curvature(gain, end)[0] for end in (low, high))
+    settled = (at_low <= 0) | (at_high >= 0)
+    ends = torch.where(at_low <= 0, low, high)
     beta, step = torch.ones_like(low).clamp(max=largest), high
     for _ in range(MAX_NEWTON_STEPS):
-        doubt = torch.sigmoid(-beta[..., None, None] * gain)
-        slope = (gain * doubt).sum((-2, -1))
-        curvature = (gain.square() * doubt * (1 - doubt)).sum((-2, -1))
+        slope, curvature = _slope_and_curvature(gain, beta)
         low, high = torch.where(slope > 0, beta, low), torch.where(slope > 0, high, beta)
         newton = beta + slope / curvature
         trusted = (low <= newton) & (newton <= high) & ((newton - beta).abs() <= step / 2)
         newer = torch.where(trusted, newton, (low + high) / 2)
         step, beta = (newer - beta).abs(), newer
-        if bool((step <= 1e-12 * largest).all()):
+        if bool((settled | (step <= 1e-10 * largest)).all()):
             break
-    return beta
+    return torch.where(settled, ends, beta)
+
+
+def _slope_and_curvature(gain: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the log pseudo-likelihood: its derivative, and less its second one."""
+    doubt = torch.sigmoid(-beta[..., None, None] * gain)
+    slope = gain * doubt
+    return slope.sum((-2, -1)), (slope * gain * (1 - doubt)).sum((-2, -1))
 
 
 def _problem(qubo: Qubo, index: int) -> Qubo:
