@@ -2,8 +2,8 @@
 
 import json
 import signal
-import time
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -121,7 +121,7 @@ def test_files_are_called_as_they_like(memcomp_solve: Solve, name: str) -> None:
 def test_default_folder_is_named_by_date_and_time(memcomp_solve: Solve) -> None:
     assert memcomp_solve("problem=ring.txt", *FAST[:2]).status == 0
     (folder,) = Path("solve").iterdir()
-    assert time.strptime(folder.name, "%Y-%m-%d_%H-%M-%S")
+    assert datetime.strptime(folder.name, "%Y-%m-%d_%H-%M-%S-%f")  # two commands of one second keep both solutions
     assert {path.name for path in folder.iterdir()} >= {"solution.json", "trajectory.png", "trajectory.svg"}
 
 
