@@ -13,13 +13,21 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from memcomp_lightning.cli.build import build, given
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
+from memcomp_lightning.cli.overrides import check_entry, check_not_given, search_paths
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
 from memcomp_lightning.cli.workers import run_all, runner
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.report import Plan, Records
 
-_SET_BY_FIGURE = {"pretrain.iterations": "iterations", "finetune.iterations": "passes", "seed": "seeds"}
+_SET_BY_FIGURE = {
+    "pretrain.iterations": "It has figure.iterations.",
+    "finetune.iterations": "It has figure.passes.",
+    "seed": "It has figure.seeds.",
+}
+_SET_BY_CURVES = (
+    "In it each curve has its own. +figure.curves.mine={label: mine, overrides: ['OVERRIDE']} adds it."
+)
 CURVE_SETTINGS = ("label", "overrides", "iterations")
 
 
@@ -85,19 +93,11 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     Raises:
         UserError, SettingError, InstantiationException: As ``build``.
     """
-    for override in overrides:
-        setting, _, value = override.lstrip("+").partition("=")
-        instead = _SET_BY_FIGURE.get(setting)
-        require(instead is None, setting, value, "nothing in a figure", f"It has figure.{instead}.")
-        remedy = "+figure.curves.mine={label: mine, overrides: ['sampler=" + value + "']} adds it."
-        require(setting != "sampler", setting, value, "nothing in a figure, where each curve has its own", remedy)
+    check_not_given(overrides, {**_SET_BY_FIGURE, "sampler": _SET_BY_CURVES}, "a figure")
     for name in ("passes", "iterations", "seeds"):
         _require_list(f"figure.{name}", config.figure[name])
     for name, curve in config.figure.curves.items():
-        for key in curve:
-            require_choice(f"setting of figure.curves.{name}", str(key), CURVE_SETTINGS)
-        for key in ("label", "overrides"):
-            require(key in curve, f"figure.curves.{name}.{key}", None, "a setting of each curve")
+        check_entry(f"figure.curves.{name}", curve, CURVE_SETTINGS)
         _require_list(f"figure.curves.{name}.iterations", curve.get("iterations", [1]))
     Plan.of(_shown(config, overrides))
     for name, settings in _curves(config, overrides).items():
@@ -166,8 +166,9 @@ def composed_for(common: tuple[str, ...], own: tuple[str, ...] = ()) -> DictConf
             where its solver is descent.
         own: The curve's overrides, which must apply.
     """
-    search_path = tuple(o for o in common if o.startswith("hydra.searchpath="))
-    return _composed(search_path, tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS)), own)
+    return _composed(
+        tuple(search_paths(common)), tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS)), own
+    )
 
 
 @functools.cache

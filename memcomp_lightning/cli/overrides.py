@@ -3,7 +3,7 @@
 import hashlib
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
 from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
 from memcomp_lightning.cli.search import planned_jobs
-from memcomp_lightning.errors import require
+from memcomp_lightning.errors import require, require_choice
 
 CONFIG_MODULE = "memcomp_lightning.conf"
 
@@ -76,7 +76,7 @@ def check_command_line(
         return
     _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
     with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
-        paths = [override for override in overrides if override.startswith(_SEARCH_PATH)]
+        paths = search_paths(overrides)
         try:
             jobs, searches = [list(overrides)], False
             if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
@@ -125,7 +125,7 @@ def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
             flags.add(argument)
         else:
             overrides.append(argument)
-    one_path = sum(override.startswith(_SEARCH_PATH) for override in overrides) <= 1
+    one_path = len(search_paths(overrides)) <= 1
     return overrides if flags <= MULTIRUN_FLAGS and one_path else None
 
 
@@ -149,6 +149,11 @@ def search_path(settings: HydraConf) -> list[str]:
     """
     sources = [source for source in settings.runtime.config_sources if "command-line" in source.provider]
     return [_searching(*(f"{source.schema}://{source.path}" for source in sources))] if sources else []
+
+
+def search_paths(overrides: Iterable[str]) -> list[str]:
+    """The overrides that say where to look for groups."""
+    return [override for override in overrides if override.startswith(_SEARCH_PATH)]
 
 
 def _searching(*places: str) -> str:
@@ -179,6 +184,29 @@ def _raise_first(messages: Iterable[str | None]) -> None:
     for message in messages:
         if message is not None:
             raise UserError(message)
+
+
+def check_not_given(overrides: Iterable[str], instead: Mapping[str, str], of: str) -> None:
+    """Refuse overrides of what runs of many networks set themselves.
+
+    Args:
+        overrides: As typed.
+        instead: What to do in their place, by setting; OVERRIDE in it stands for what was typed.
+        of: The kind of run.
+    """
+    for override in overrides:
+        typed = override.lstrip("+")
+        name, _, value = typed.partition("=")
+        remedy = instead.get(name, "").replace("OVERRIDE", typed)
+        require(name not in instead, name, value, f"nothing in {of}", remedy)
+
+
+def check_entry(name: str, settings: DictConfig, known: Collection[str]) -> None:
+    """Refuse unknown settings of a curve, a data set or a method, and one without its label or overrides."""
+    for key in settings:
+        require_choice(f"setting of {name}", str(key), known)
+    for key in ("label", "overrides"):
+        require(key in settings, f"{name}.{key}", None, "a setting of each")
 
 
 def check_finite(node: Any, name: str = "") -> None:

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
+from memcomp_lightning.cli.overrides import check_entry, check_not_given
 from memcomp_lightning.cli.workers import run_all, runner
 from memcomp_lightning.cli.worth_job import Job, model_of, module_of, run_job, side_by_side
 from memcomp_lightning.cli.worth_measures import MEASURES, measure_of
@@ -18,6 +19,7 @@ from memcomp_lightning.files import write_text
 from memcomp_lightning.report.worth import Courses
 
 DATA_SETTINGS = ("label", "overrides", "passes", "measure", "methods", "rates", "replicas", "choosing", "points")
+_SET_BY_COMPARISON = {"pretrain.iterations": "It has passes of its data sets.", "sampler": "It has methods."}
 METHOD_SETTINGS = ("label", "overrides", "longer", "rates", "greedy_start")
 
 
@@ -36,17 +38,11 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for key in ("replicas", "choosing", "points", "gradient_draws"):
         require_count(f"worth.{key}", worth[key])
     require(len(worth.rates) > 0, "worth.rates", list(worth.rates), "at least one learning rate")
-    for override in overrides:
-        name, _, value = override.lstrip("+").partition("=")
-        own = {"pretrain.iterations": "passes of its data sets", "sampler": "methods"}.get(name)
-        require(own is None, name, value, "nothing in a comparison", f"It has {own}.")
+    check_not_given(overrides, _SET_BY_COMPARISON, "a comparison")
     require(worth.only is None or len(worth.only) > 0, "worth.only", [], "names of data sets, or null for all")
     for kind, known in (("data_sets", DATA_SETTINGS), ("methods", METHOD_SETTINGS)):
         for name, settings in worth[kind].items():
-            for key in settings:
-                require_choice(f"setting of worth.{kind}.{name}", str(key), known)
-            for key in ("label", "overrides"):
-                require(key in settings, f"worth.{kind}.{name}.{key}", None, "a setting of each")
+            check_entry(f"worth.{kind}.{name}", settings, known)
             longer = settings.get("longer", 1)
             require(longer > 0, f"worth.{kind}.{name}.longer", longer, "a number > 0")
             for key in ("methods", "rates"):
