@@ -1,7 +1,8 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
+import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import lightning.pytorch as pl
 import torch
@@ -12,12 +13,38 @@ from memcomp_lightning.callbacks.base import (
     EveryIterations,
     LastImages,
     images_of_step,
+    iteration_of,
     log_scalars,
     rbm_of,
     require_enumerable,
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.models.enumeration import n_enumerated
+
+QUICKLY_ENUMERATED = 16
+"""Units that "auto" enumerates at most."""
+
+QUICKLY_ANNEALED = 10**10
+"""Products of a unit and a weight in all chains and steps of AIS that "auto" computes at most: about a second."""
+
+
+class LikelihoodValue(TypedDict):
+    """What one look of :class:`LogLikelihood` found.
+
+    Attributes:
+        layer: Index of the model among those that the module trains.
+        iteration: Passes that the model had been trained for, from 1.
+        method: "exact" or "ais", as log Z was found.
+        train: Nats an image of the training images, one number a replica.
+        heldout: The same of held-out images; empty if there was no validation at the end of the pass.
+    """
+
+    layer: int
+    iteration: int
+    method: str
+    train: list[float]
+    heldout: list[float]
 
 
 class LogLikelihood(EveryIterations):
@@ -34,9 +61,13 @@ class LogLikelihood(EveryIterations):
     training images, log Z is an estimate that tends to be too small, the likelihood too large;
     ``log_z_standard_error`` and ``log_z_effective_sample_size``, of ``n_chains``, say how far to trust it.
 
+    Attributes:
+        history: Every value so far, the oldest first; checkpoints keep it.
+
     Args:
-        every: Passes between two values, >= 1.
-        method: "exact" enumerates the smaller layer; "ais" estimates log Z at any size.
+        every: Passes between two values, >= 1; None means about ten values a stage.
+        method: "exact" enumerates the smaller layer; "ais" estimates log Z at any size; "auto" enumerates up to 16
+            units, estimates where that takes about a second at most, and gives no value of larger models.
         n_images: Training images a replica to judge, >= 1.
         max_units: Largest smaller layer to enumerate, >= 1.
         n_chains: Chains of AIS, >= 2.
@@ -49,8 +80,8 @@ class LogLikelihood(EveryIterations):
 
     def __init__(
         self,
-        every: int = 200,
-        method: Literal["exact", "ais"] = "ais",
+        every: int | None = None,
+        method: Literal["auto", "exact", "ais"] = "auto",
         *,
         n_images: int = 1000,
         max_units: int = 25,
@@ -58,8 +89,9 @@ class LogLikelihood(EveryIterations):
         n_betas: int = 1000,
         seed: int = 0,
     ) -> None:
-        super().__init__(every)
-        require_choice("method", method, ("exact", "ais"))
+        super().__init__(1 if every is None else every)
+        self._about_ten = every is None
+        require_choice("method", method, ("auto", "exact", "ais"))
         require_count("max_units", max_units)
         require_count("n_chains", n_chains, minimum=2)
         require_count("n_betas", n_betas)
@@ -68,13 +100,16 @@ class LogLikelihood(EveryIterations):
         self.n_chains = n_chains
         self.n_betas = n_betas
         self.seed = seed
+        self.history: list[LikelihoodValue] = []
         self._train = LastImages(n_images)
         self._heldout: list[tuple[Tensor, int]] = []
         self._judged_at = -1
         self._bits: Generator | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Refuse models too large to enumerate."""
+        """Refuse models too large to enumerate; settle how often to look."""
+        if self._about_ten:
+            self.every = max(1, (trainer.max_epochs or 1) // 10)
         if self.method == "exact":
             require_enumerable(self, pl_module, self.max_units)
 
@@ -88,7 +123,7 @@ class LogLikelihood(EveryIterations):
     ) -> None:
         """Keep the visible states of the last batches."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if self.is_due(trainer, pl_module):
+        if self._looks(trainer, pl_module):
             self._train.add(images_of_step(outputs, self))
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -108,15 +143,18 @@ class LogLikelihood(EveryIterations):
         dataloader_idx: int = 0,
     ) -> None:
         """Unnormalised log-likelihood of one chunk of held-out images."""
-        if self.is_due(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
+        if self._looks(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
             v = required(outputs, "v", self)
             self._heldout.append((self._total(rbm_of(pl_module), v, self._bits), v.shape[-2]))
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Normalise."""
         rbm = rbm_of(pl_module)
+        method = self._method_for(rbm)
+        if method is None:
+            return
         train = self._train.images()
-        values = self._partition_function(rbm, train)
+        values = self._partition_function(rbm, method, train)
         log_z = values["log_z"]
         if train is not None:
             total = self._total(rbm, train, rng.stream(self.seed, "log_likelihood", 0))
@@ -126,10 +164,41 @@ class LogLikelihood(EveryIterations):
             n_images = sum(n for _, n in self._heldout)
             values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
         log_scalars(pl_module, values)
+        self.history.append(
+            LikelihoodValue(
+                layer=int(getattr(pl_module, "layer", 0)),
+                iteration=iteration_of(pl_module) + 1,
+                method=method,
+                train=_numbers(values.get("log_likelihood_train")),
+                heldout=_numbers(values.get("log_likelihood_heldout")),
+            )
+        )
 
-    def _partition_function(self, rbm: Any, train: Tensor | None) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Any]:
+        """The values so far."""
+        return {"history": list(self.history)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take back the values so far."""
+        self.history = list(state_dict["history"])
+
+    def _looks(self, trainer: pl.Trainer, module: pl.LightningModule) -> bool:
+        """Whether the present pass ends with a value."""
+        return self.is_due(trainer, module) and self._method_for(rbm_of(module)) is not None
+
+    def _method_for(self, model: Any) -> Literal["exact", "ais"] | None:
+        """How log Z of a model is found; None if it is not."""
+        if self.method != "auto":
+            return self.method
+        if n_enumerated(model) <= min(QUICKLY_ENUMERATED, self.max_units):
+            return "exact"
+        two_layers = len(getattr(model, "classes", "vh")) == 2
+        n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
+        return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
+
+    def _partition_function(self, rbm: Any, method: str, train: Tensor | None) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
-        if self.method == "exact":
+        if method == "exact":
             return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
         base = None if train is None else likelihood.base_of(train)
@@ -146,3 +215,8 @@ class LogLikelihood(EveryIterations):
         log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
         v = rng.bernoulli(v, generator=bits)
         return likelihood.log_likelihood_or_bound(rbm, v, log_z).double().sum(-1)
+
+
+def _numbers(values: Tensor | None) -> list[float]:
+    """One number a replica."""
+    return [] if values is None else [float(value) for value in values.flatten()]

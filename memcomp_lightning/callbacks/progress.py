@@ -20,7 +20,14 @@ class StageProgressBar(ProgressBar):
     """
 
     def __init__(
-        self, metrics: tuple[str, ...] = ("reconstruction_error", "contrast", "loss", "heldout_accuracy")
+        self,
+        metrics: tuple[str, ...] = (
+            "reconstruction_error",
+            "contrast",
+            "log_likelihood_heldout",
+            "loss",
+            "heldout_accuracy",
+        ),
     ) -> None:
         super().__init__()
         self.metrics = tuple(metrics)

@@ -13,12 +13,14 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import short_path
+from memcomp_lightning.cli.table import final_log_likelihoods, short_path
+from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import (
@@ -80,6 +82,7 @@ def run(
             held_out = evaluate(module.network, plan.finetuning.data.val_dataloader(), module.loss)
             result["validation_accuracy"] = _numbers(held_out.accuracy)
     if is_global_zero and not config.trainer.fast_dev_run:
+        result["context"] = _context(plan, result)
         _log_final(loggers, config, result)
         folder.finish(result)
     return result
@@ -184,7 +187,26 @@ def _record(stage: Stage) -> dict[str, Any]:
     if isinstance(module, EnergyPretraining):
         record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
         record["trained"] = module.model_names
+    for callback in stage.callbacks:
+        if isinstance(callback, LogLikelihood) and callback.history:
+            record["log_likelihood"] = callback.history
     return record
+
+
+def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
+    """What simple models reach on the same data; of several parts of the training set, on the first."""
+    data = plan.stages[0].data
+    (train, label), (heldout, _) = data.train, data.heldout
+    if data.replicas:
+        train, label = train[0], label[0]
+        heldout = heldout if heldout.ndim == 2 else heldout[0]
+    context: dict[str, Any] = {}
+    if "test_accuracy" in result:
+        accuracy = logistic_regression((train, label), data.test)
+        context["logistic_regression"] = {"test_accuracy": accuracy, "n_images": n_fitted(train)}
+    if any("log_likelihood" in record for record in result["stages"].values()):
+        context["independent_units"] = {"heldout": independent_log_likelihood(train, heldout)}
+    return context
 
 
 def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]) -> None:
@@ -194,6 +216,8 @@ def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]
         metrics["final/test_accuracy"] = sum(result["test_accuracy"]) / len(result["test_accuracy"])
     for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
         metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
+    for layer, value in enumerate(final_log_likelihoods(result), start=1):
+        metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
     metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
     write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)
     for logger in loggers:

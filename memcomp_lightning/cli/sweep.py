@@ -10,7 +10,15 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import aligned, mean_and_error, short_path, with_error
+from memcomp_lightning.cli.table import (
+    LIKELIHOOD_TITLE,
+    aligned,
+    final_log_likelihoods,
+    mean_and_error,
+    short_path,
+    with_error,
+    without_empty_columns,
+)
 from memcomp_lightning.files import write_text
 
 
@@ -61,7 +69,17 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
     swept = [name for name in names if len({setting.get(name) for setting in settings}) > 1]
     held_out = any("validation_accuracy" in result for results in groups.values() for result in results)
     held_out_title = ["held-out accuracy"] if held_out else []
-    screen = [[*swept, "runs x replicas", "energy gap, top layer", *held_out_title, "test accuracy", "wall time"]]
+    screen = [
+        [
+            *swept,
+            "runs x replicas",
+            "energy gap, top layer",
+            f"{LIKELIHOOD_TITLE}, first layer",
+            *held_out_title,
+            "test accuracy",
+            "wall time",
+        ]
+    ]
     sheet: list[list[Any]] = [
         [
             *swept,
@@ -69,6 +87,8 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
             "n_values",
             "energy_gap_mean",
             "energy_gap_error",
+            "log_likelihood_mean",
+            "log_likelihood_error",
             *(["validation_accuracy_mean", "validation_accuracy_error"] if held_out else []),
             "test_accuracy_mean",
             "test_accuracy_error",
@@ -83,6 +103,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
             for result in results
             for gap in (result["stages"].get("pretrain", {}).get("energy_gap") or [[]])[-1]
         ]
+        nats = [value for result in results for layer in final_log_likelihoods(result)[:1] for value in layer]
         accuracies = [accuracy for result in results for accuracy in result.get("test_accuracy", [])]
         judged = [accuracy for result in results for accuracy in result.get("validation_accuracy", [])]
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
@@ -93,6 +114,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 *values,
                 f"{len(results)} x {n_values // len(results)}",
                 with_error(gaps) if gaps else "",
+                with_error(nats, digits=2) if nats else "",
                 *([with_error(judged) if judged else ""] if held_out else []),
                 with_error(accuracies) if accuracies else "",
                 f"{sum(seconds) / len(seconds):.1f} s",
@@ -104,6 +126,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
                 len(results),
                 n_values,
                 *(mean_and_error(gaps) if gaps else ("", "")),
+                *(mean_and_error(nats) if nats else ("", "")),
                 *((mean_and_error(judged) if judged else ("", "")) if held_out else ()),
                 *(mean_and_error(accuracies) if accuracies else ("", "")),
                 sum(seconds) / len(seconds),
@@ -112,7 +135,7 @@ def _table(groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]], fold
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(sheet)
     write_text(folder / "table.csv", buffer.getvalue())
-    return aligned(screen)
+    return aligned(without_empty_columns(screen))
 
 
 def _order(setting: dict[str, str], names: list[str]) -> list[tuple[int, float, str]]:

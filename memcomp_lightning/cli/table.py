@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+LIKELIHOOD_TITLE = "log-likelihood (held-out)"
+
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float | None]:
     """Mean and standard error sigma / sqrt(n); the error of a single value is None.
@@ -37,21 +39,43 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(lines)
 
 
+def final_log_likelihoods(result: dict[str, Any]) -> list[list[float]]:
+    """The last held-out log-likelihood of each pretrained model, one number a replica; [] where none was found."""
+    record = result["stages"].get("pretrain", {})
+    last = {value["layer"]: value["heldout"] for value in record.get("log_likelihood", [])}
+    return [last.get(layer, []) for layer in range(len(record.get("trained", [])))]
+
+
 def run_table(result: dict[str, Any]) -> str:
-    """Energy gap, test accuracy and wall time of each stage of one run, and what held-out images chose for it."""
-    rows = [["stage", "iterations", "energy gap (data - model)", "test accuracy", "wall time"]]
+    """What each stage of one run reached, what simple models reach, and what held-out images chose for the run."""
+    title = ["stage", "iterations", "energy gap (data - model)", LIKELIHOOD_TITLE, "test accuracy", "wall time"]
+    rows = [title]
+    likelihoods = final_log_likelihoods(result)
     for name, record in result["stages"].items():
         gaps = record.get("energy_gap", [])
-        for trained, gap in zip(record.get("trained", []), gaps, strict=False):
-            rows.append([f"{name} {trained}", str(record["iterations"]), with_error(gap), "", ""])
+        for layer, (trained, gap) in enumerate(zip(record.get("trained", []), gaps, strict=False)):
+            nats = with_error(likelihoods[layer], digits=2) if likelihoods[layer] else ""
+            rows.append([f"{name} {trained}", str(record["iterations"]), with_error(gap), nats, "", ""])
         if not gaps:
-            rows.append([name, str(record["iterations"]), "", with_error(result["test_accuracy"]), ""])
+            rows.append([name, str(record["iterations"]), "", "", with_error(result["test_accuracy"]), ""])
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"
+    context = result.get("context", {})
+    if (independent := context.get("independent_units")) is not None:
+        rows.append(["(independent units)", "", "", f"{independent['heldout']:.2f}", "", ""])
+    if (regression := context.get("logistic_regression")) is not None:
+        name = f"(logistic regression, {regression['n_images']:,} images)"
+        rows.append([name, "", "", "", f"{regression['test_accuracy']:.4f}", ""])
     choice = result.get("choice")
     chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
     judged = result.get("validation_accuracy")
     held_out = f"\nAccuracy on held-out training images: {with_error(judged)}" if judged else ""
-    return aligned(rows) + chosen + held_out
+    return aligned(without_empty_columns(rows)) + chosen + held_out
+
+
+def without_empty_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The rows without the columns that hold nothing below their title."""
+    filled = [any(row[column] for row in rows[1:]) for column in range(len(rows[0]))]
+    return [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
 
 
 def closing_lines(folder: Path) -> str:

@@ -4,6 +4,7 @@ A source (:class:`Digits`, :class:`Mnist`, ...) is a frozen set of settings whos
 :class:`ImageData`; :class:`ImageDataModule` deals that into replicas and batches.
 """
 
+from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression
 from memcomp_lightning.data.digits import Digits
 from memcomp_lightning.data.idx import CorruptFileError
 from memcomp_lightning.data.images import ImageData, ImageSource, PixelLayout
@@ -28,5 +29,7 @@ __all__ = [
     "PixelLayout",
     "ReducedMnist",
     "ShiftingBars",
+    "independent_log_likelihood",
+    "logistic_regression",
     "reduce_images",
 ]

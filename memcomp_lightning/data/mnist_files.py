@@ -46,17 +46,19 @@ class MnistArrays(NamedTuple):
     test_labels: UInt8[Tensor, " n_test"]
 
 
+def cache_folder() -> Path:
+    """Return ``$XDG_CACHE_HOME/memcomp_lightning``, or ``~/.cache/memcomp_lightning``."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser().absolute() / "memcomp_lightning"
+
+
 def raw_folder(data_dir: str | None) -> Path:
     """Return the folder of the files, ``<root>/MNIST/raw``.
 
     The root is ``data_dir``, else the environment variable ``MEMCOMP_DATA_DIR``, else
-    ``$XDG_CACHE_HOME/memcomp_lightning``, else ``~/.cache/memcomp_lightning``.
+    :func:`cache_folder`.
     """
     root = data_dir or os.environ.get("MEMCOMP_DATA_DIR")
-    if not root:
-        cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-        root = f"{cache}/memcomp_lightning"
-    return Path(root).expanduser().absolute() / "MNIST" / "raw"
+    return (Path(root).expanduser().absolute() if root else cache_folder()) / "MNIST" / "raw"
 
 
 def read(data_dir: str | None, *, download: bool) -> MnistArrays:

@@ -79,6 +79,16 @@ class ImageDataModule(LightningDataModule):
         self.train_batches(rank=0, world_size=1)
 
     @property
+    def train(self) -> tuple[Tensor, Tensor]:
+        """Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
+        return self._train
+
+    @property
+    def heldout(self) -> tuple[Tensor, Tensor]:
+        """The images of the validation: those held out, or the test images, which all replicas share."""
+        return self._held_out
+
+    @property
     def test(self) -> tuple[Tensor, Tensor]:
         """Test images ``(n, n_visible)`` and labels ``(n,)``."""
         return self.images.test_v, self.images.test_label
