@@ -1,3 +1,3 @@
 """Restricted Boltzmann machines and deep belief networks whose negative phase is a swappable part."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

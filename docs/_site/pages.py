@@ -20,6 +20,7 @@ INTERNAL = ("cli", "conf")
 
 # Titles of results, in the order of the README; other experiments follow under their own headings.
 TITLES = {
+    "defaults": "Default settings",
     "figure2": "Figure 2",
     "figure4": "Figure 4",
     "figure5": "Figure 5",
@@ -55,7 +56,8 @@ GROUP_TEXTS = {
     "logger": "Where numbers and pictures go.",
     "model": "The network.",
     "positive": "What supplies the hidden units given the data where they are coupled to each other.",
-    "preset": "How much of a figure is computed.",
+    "preset": "Settings of all groups at once: those of the paper, or those of a figure in a minute or two.",
+    "preset/figure": "What a preset does to a figure.",
     "pretrain": "Pretraining: rate, updates, which layers at once.",
     "sampler": "What supplies the negative phase; [where each one sits](../concepts.md).",
     "solver": "What looks for ground states of the QUBO, of the samplers that need one and of `memcomp-solve`.",

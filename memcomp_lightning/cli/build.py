@@ -21,7 +21,7 @@ from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
-from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser
+from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser, start_at_means
 from memcomp_lightning.modules import (
     BoltzmannPretraining,
     Classifier,
@@ -82,7 +82,7 @@ _GROUPS = (
 _SETTINGS = {
     "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
-    "pretrain": (*_STAGE_SETTINGS, "centring", "module"),
+    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "module"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units"),
     "callbacks": ("pretrain", "finetune"),
 }
@@ -115,6 +115,10 @@ def build(config: DictConfig) -> Plan:
         centring = instantiate(config.pretrain.centring)
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
+        initial_bias = config.pretrain.initial_bias
+        require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
+        if initial_bias == "data" and config.model.weights is None:
+            start_at_means(network[0] if isinstance(network, DBN) else network, data.train[0])
         make = instantiate(config.pretrain.module)
         _check_module(make, network)
         try:
@@ -219,7 +223,7 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
 def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
     """The sampler; the schedule of mode assistance spans all updates of a layer unless it says otherwise."""
     settings = copy.deepcopy(config.sampler)
-    schedule, size = settings.get("schedule"), config.pretrain.batch_size or data.n_train
+    schedule, size = settings.get("schedule"), min(config.pretrain.batch_size or data.n_train, data.n_train)
     if schedule is not None and schedule.get("n_updates") is None:
         schedule.n_updates = config.pretrain.iterations * math.ceil(data.n_train / size)
     sampler = instantiate(settings)

@@ -28,8 +28,8 @@ class Batches:
     Args:
         v: Intensities, ``(*replicas, n, n_visible)``.
         label: Class indices, ``(*replicas, n)``.
-        batch_size: Images of a replica in an optimiser step, over all processes, 1 to n; the last step of a
-            pass takes what is left. None means all n.
+        batch_size: Images of a replica in an optimiser step, over all processes, >= 1; the last step of a
+            pass takes what is left. None, or n and more, means all n.
         chunk_size: Images of a replica that one Batch holds at most, >= 1.
         shuffle: Whether each epoch has another order.
         seed: Seed of the order.
@@ -60,8 +60,6 @@ class Batches:
         n = label.shape[-1]
         if batch_size is not None:
             require_count("batch_size", batch_size)
-            remedy = "Choose a smaller batch_size, or null for one step with all images."
-            require(batch_size <= n, "batch_size", batch_size, f"at most the {n} training images", remedy)
         require_count("chunk_size", chunk_size)
         require_count("seed", seed, minimum=0)
         require_count("world_size", world_size)

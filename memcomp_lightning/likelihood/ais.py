@@ -16,6 +16,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
 from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
+from memcomp_lightning.models.init import mean_log_odds
 from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor
@@ -167,8 +168,7 @@ def base_of(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_vis
     >>> base_of(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
     tensor([1.0986, 0.0000])
     """
-    n_on = v.sum(-2)
-    return torch.log((n_on + 1) / (v.shape[-2] - n_on + 1))
+    return mean_log_odds(v)
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine, folded
 from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
-from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier
+from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier, mean_log_odds, start_at_means
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.randomise import GaussianMoments, Randomiser, Shuffled
 from memcomp_lightning.models.rbm import RBM
@@ -29,5 +29,7 @@ __all__ = [
     "folded",
     "hidden_blocks",
     "mean_field",
+    "mean_log_odds",
+    "start_at_means",
     "with_batch_norm_relu",
 ]

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Generator, Tensor
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require
 
@@ -60,3 +61,32 @@ class Xavier:
         """Return a tensor of this shape, drawn from ``generator``."""
         bound = self.gain * math.sqrt(6.0 / (shape[-1] + shape[-2]))
         return torch.empty(shape).uniform_(-bound, bound, generator=generator)
+
+
+def mean_log_odds(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_visible"]:
+    """Biases of independent units that have the data's means: log (n_on + 1) / (n_off + 1).
+
+    >>> mean_log_odds(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
+    tensor([1.0986, 0.0000])
+    """
+    n_on = v.sum(-2)
+    return torch.log((n_on + 1) / (v.shape[-2] - n_on + 1))
+
+
+class HasVisibleBias(Protocol):
+    """An energy model, as far as :func:`start_at_means` needs it."""
+
+    b: nn.Parameter
+
+
+@torch.no_grad()
+def start_at_means(model: HasVisibleBias, v: Float[Tensor, "*axes n n_visible"]) -> None:
+    """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
+
+    Hinton 2012, A Practical Guide to Training RBMs, section 8.1.
+
+    Args:
+        model: An RBM or a Boltzmann machine.
+        v: Training data, ``(*replicas, n, n_visible)``, or without replica axes for the same data everywhere.
+    """
+    model.b.copy_(mean_log_odds(v).expand(model.b.shape))
