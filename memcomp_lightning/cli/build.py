@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -258,7 +259,9 @@ def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> 
             if isinstance(callback, MomentumSchedule):
                 callback.check(optimizer)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{stage}.optimizer: {in_words(error)}") from error
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        remedy = f" Leave it out: '~{stage}.optimizer.{unknown[1]}'." if unknown else ""
+        raise UserError(f"{stage}.optimizer: {in_words(error)}{remedy}") from error
     return factory
 
 
