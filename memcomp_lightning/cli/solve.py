@@ -1,12 +1,14 @@
 """``memcomp-solve``: look for the minimum of a problem that stands in a file."""
 
+import math
+import os
 import sys
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
@@ -28,6 +30,10 @@ from memcomp_lightning.files import written_whole
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.qubo import (
     FORMATS,
+    Answer,
+    Bipartite,
+    BranchAndBound,
+    BruteForce,
     Problem,
     ProblemFileError,
     Qubo,
@@ -35,6 +41,7 @@ from memcomp_lightning.qubo import (
     QuboSolver,
     Trajectory,
     WeightedMaxSat,
+    in_full,
     read_problem,
     to_qubo,
     write_solution,
@@ -54,9 +61,9 @@ def solve(config: DictConfig) -> None:
     """One problem, or one job of a sweep."""
     try:
         problem, solver = prepare(config)
-        print(f"{problem.name}: {_headline(problem)}", flush=True)
-        solution = _minimise(problem.problem, solver, config.seed)
-        print(f"\n{_table(problem, solution)}\n", flush=True)
+        print("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]), flush=True)
+        solution = _minimise(problem, solver, config.seed)
+        print(f"\n{_table(problem, problem.answer(solution), solution.wall_time_s)}\n", flush=True)
         folder = Path(HydraConfig.get().runtime.output_dir)
         _write(folder, config, problem, solution)
     except (UserError, SettingError, ProblemFileError) as error:
@@ -82,10 +89,9 @@ def prepare(config: DictConfig) -> tuple[Problem, QuboSolver]:
         )
     solver: QuboSolver = instantiate(config.solver)
     problem = _read(str(config.problem), config.format, config.maximise)
-    if isinstance(solver, DmmSolver):
-        _check_memory(problem.problem, solver)
-    else:
+    if not isinstance(solver, DmmSolver):
         _as_qubo(problem.problem)
+    _check_memory(problem, solver)
     return problem, solver
 
 
@@ -95,11 +101,20 @@ def _read(file: str, format: str | None, maximise: bool) -> Problem:
     return read_problem(Path(file).expanduser(), format, maximise=maximise)
 
 
-def _minimise(problem: Qubo | WeightedMaxSat, solver: QuboSolver, seed: int) -> QuboSolution:
-    generator = rng.stream(seed, "solver")
-    if isinstance(solver, DmmSolver):
-        return solver.minimise(problem, generator=generator)
-    return solver.minimise(_as_qubo(problem), generator=generator)
+def _minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
+    """The solver's answer; without variables there is one state, and no solver has to look for it."""
+    generator, given = rng.stream(seed, "solver"), problem.problem
+    if given.n == 0:
+        return BruteForce().minimise(_as_qubo(given), generator=generator)
+    try:
+        if isinstance(solver, DmmSolver):
+            return solver.minimise(given, generator=generator)
+        exact = problem.integers if isinstance(solver, BruteForce) and not problem.resolved else None
+        return solver.minimise(_as_qubo(given) if exact is None else exact, generator=generator)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError) or "memory" in str(error):
+            raise UserError(_too_large(problem, solver)) from error
+        raise
 
 
 def _as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
@@ -107,10 +122,11 @@ def _as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
     return problem if isinstance(problem, Qubo) else to_qubo(problem)
 
 
-def _check_memory(problem: Qubo | WeightedMaxSat, solver: DmmSolver) -> None:
-    """Refuse to record a trajectory that no memory holds."""
-    if solver.record is not None:
-        n_bytes = solver.n_restarts * (solver.max_steps or default_steps(problem)) * problem.n
+def _check_memory(problem: Problem, solver: QuboSolver) -> None:
+    """Refuse what no memory holds: a recorded trajectory, or the states of all restarts."""
+    given = problem.problem
+    if isinstance(solver, DmmSolver) and solver.record is not None:
+        n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
         require(
             n_bytes // solver.record.every <= MOST_RECORDED,
             "solver.record.every",
@@ -118,6 +134,45 @@ def _check_memory(problem: Qubo | WeightedMaxSat, solver: DmmSolver) -> None:
             f"at least {1 + n_bytes // MOST_RECORDED}, for a trajectory of at most {MOST_RECORDED // 2**30} GiB",
             "solver=dmm records nothing.",
         )
+    if _memory(given, solver) > _installed():
+        raise UserError(_too_large(problem, solver))
+
+
+def _memory(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
+    """About the bytes that a solver works with: a few numbers a variable and a coupling, each restart."""
+    if isinstance(solver, (BruteForce, BranchAndBound)):
+        return 0
+    longer = () if isinstance(problem, Qubo) else problem.longer
+    pairs = 0 if isinstance(problem.graph, Bipartite) else math.prod(problem.graph.edge_shape)
+    numbers = problem.n + pairs + sum(block.variables.numel() for block in longer)
+    return _NUMBERS_EACH * 8 * int(getattr(solver, "n_restarts", 1)) * numbers
+
+
+_NUMBERS_EACH = 5
+"""Of eight bytes, for a variable or a coupling of a restart; measured."""
+
+
+def _installed() -> float:
+    """Bytes of memory of this computer; infinite where it does not tell."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
+
+
+def _too_large(problem: Problem, solver: QuboSolver) -> str:
+    """Why the solver does not fit, and what to do."""
+    sizes = ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in problem.sizes.items())
+    restarts = getattr(solver, "n_restarts", None)
+    each = "" if restarts is None else f" with solver.n_restarts = {restarts}"
+    remedy = "a smaller problem" if restarts in (None, 1) else "fewer restarts, as solver.n_restarts=1"
+    needed, installed = (
+        f"{n_bytes / 2**30:.0f} GiB" for n_bytes in (_memory(problem.problem, solver), _installed())
+    )
+    return (
+        f"{problem.path}: {sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
+        f"more than there is ({installed}): try {remedy}."
+    )
 
 
 def _headline(problem: Problem) -> str:
@@ -127,29 +182,38 @@ def _headline(problem: Problem) -> str:
     return f"{counts}{f' ({n_hard} hard)' if n_hard else ''}; format {problem.format}, {problem.path}"
 
 
-def _table(problem: Problem, solution: QuboSolution) -> str:
+def _remarks(problem: Problem, solver: QuboSolver) -> list[str]:
+    """What a person should know before the solver begins, a line each."""
+    remarks = list(problem.remarks)
+    if problem.n_unused:
+        remarks.append(
+            f"{problem.n_unused} of the variables are not used: they cost nothing, and are reported as 0."
+        )
+    if (needed := _memory(problem.problem, solver)) >= 2**30:
+        remarks.append(f"The solver needs about {needed / 2**30:.0f} GiB of memory.")
+    return [f"Note: {remark}" for remark in remarks]
+
+
+def _table(problem: Problem, answer: Answer, wall_time_s: float) -> str:
     """The answer as names and values."""
-    score = problem.score(solution.best)
-    rows = [(problem.objective.name, f"{score.value:.10g}  ({problem.objective.direction})")]
+    broken = answer.score.hard_unsatisfied
+    rows = [(problem.objective.name, f"{in_full(answer.score.value)}  ({problem.objective.direction})")]
     if "hard_clauses" in problem.sizes:
-        rows.append(("hard clauses", f"{score.hard_unsatisfied} unsatisfied"))
-    best = float(solution.best_energy)
-    reached = torch.isclose(solution.energies, solution.best_energy, rtol=1e-9, atol=1e-9)
-    run = solution.energies.isfinite()
-    messages = [(message.partition(": "), count) for message, count in solution.messages().items()]
+        rows.append(("hard clauses", f"{broken} unsatisfied{': this is no solution' if broken else ''}"))
+    status = Counter(sorted(answer.status))
     rows += [
-        ("energy", f"{best:.10g}  (reached by {int(reached.sum())} of {int(run.sum())} restarts)"),
-        ("wall time", f"{solution.wall_time_s:.2f} s"),
-        *((f"{count} x {name}", advice) for (name, _, advice), count in messages),
+        ("energy", f"{in_full(answer.energy)}  (reached by {answer.n_reached} of {answer.n_run} restarts)"),
+        ("wall time", f"{wall_time_s:.2f} s"),
+        *((f"{count} x {ended.name}", ended.advice) for ended, count in status.items()),
     ]
-    if problem.problem.n <= _LONGEST_PRINTED:
-        rows.append(("assignment", _bits(solution.best)))
+    if problem.n <= _LONGEST_PRINTED:
+        rows.append(("assignment", _bits(answer.assignment)))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name.ljust(width)}  {value}" for name, value in rows)
 
 
 def _bits(x: Tensor) -> str:
-    return "".join("1" if bit else "0" for bit in (x > 0.5).tolist())
+    return "".join("1" if bit else "0" for bit in x.tolist())
 
 
 def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> None:
@@ -161,7 +225,7 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_solution(file, problem, solution, solver=settings, seed=config.seed)
-        holds = "" if problem.problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
+        holds = "" if problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
         print(f"Solution:    {short_path(file)}{holds}", flush=True)
         if solution.trajectory is not None:
             picture = _draw(folder, problem.name, solution.trajectory)

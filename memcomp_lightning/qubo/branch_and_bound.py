@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Generator
 
 from memcomp_lightning.errors import SettingError, require_count
@@ -31,7 +32,9 @@ class BranchAndBound:
         require_count("max_nodes", self.max_nodes)
 
     def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
-        """Return one assignment a problem, with the status OPTIMAL where it is proven.
+        """Return one assignment a problem, with the status OPTIMAL where it is proven, to the rounding of float64.
+
+        Of integers whose sums float64 holds the proof is exact; where it rounds them the status is ROUNDED.
 
         The generator starts a descent, whose energy saves most of the work.
 
@@ -60,15 +63,15 @@ class BranchAndBound:
                 weight, own, other = weight.T, other, own
             order = np.argsort(-np.abs(weight).sum(1))
             weight = np.ascontiguousarray(weight[order])
-            # Only what lies below the known energy by more than its rounding is new.
-            limit = energy - 1e-9 * abs(energy)
+            margin, complete = _margin(weight, own, other)
+            limit = energy - margin
             lowest, state, proven, n_nodes = search(weight, own[order], other, limit, self.max_nodes)
             if lowest < limit:
                 smaller, larger = np.empty(len(order)), other + state @ weight < 0
                 smaller[order] = state
                 layers = (larger, smaller) if second_is_smaller else (smaller, larger)
                 best[p] = torch.from_numpy(np.concatenate(layers))
-            status.append(int(Status.OPTIMAL if proven else Status.STEP_BUDGET))
+            status.append(int(complete if proven else Status.STEP_BUDGET))
             nodes.append(n_nodes)
         assignments = best.reshape(*qubo.problems, 1, qubo.n).to(qubo.linear)
         each = (*qubo.problems, 1)
@@ -79,3 +82,16 @@ class BranchAndBound:
             steps=torch.tensor(nodes, device=assignments.device).reshape(each),
             wall_time_s=time.perf_counter() - begin,
         )
+
+
+def _margin(*numbers: NDArray[np.float64]) -> tuple[float, Status]:
+    """How far below the known energy a state must lie to be new, and the status of a search that came to its end.
+
+    Half of the smallest difference between sums of integers, which proves exactly; of other numbers the error of a
+    sum in float64, so that states of equal energy are not searched again and again.
+    """
+    size = float(sum(np.abs(part).sum() for part in numbers))
+    error = size * sum(part.size for part in numbers) * float(np.finfo(np.float64).eps)
+    if any((part != np.rint(part)).any() for part in numbers):
+        return error, Status.OPTIMAL
+    return (0.5, Status.OPTIMAL) if error < 0.5 else (error, Status.ROUNDED)

@@ -35,6 +35,8 @@ class BruteForce:
     def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
         """Return the minimum as a single restart; the generator is not used.
 
+        A problem in int64 is compared in int64. Its status is ROUNDED where float64 rounds sums of integers.
+
         Raises:
             SettingError: More variables to enumerate than ``max_variables``.
         """
@@ -48,10 +50,14 @@ class BruteForce:
             f"at most max_variables = {self.max_variables}",
             "Use a heuristic (DmmSolver, AlternatingDescent), or raise max_variables: each one doubles the time.",
         )
-        best_energy = torch.full(qubo.problems, torch.inf, dtype=torch.float64, device=qubo.linear.device)
+        exact = qubo.linear.dtype == torch.int64
+        worst = torch.iinfo(torch.int64).max if exact else torch.inf
+        best_energy = torch.full(
+            qubo.problems, worst, dtype=torch.int64 if exact else torch.float64, device=qubo.linear.device
+        )
         best = qubo.linear.new_zeros(*qubo.problems, enumerated)
         layers = _Layers(qubo) if isinstance(graph, Bipartite) else None
-        at_once = max(1, min(self.chunk_size, _NUMBERS // qubo.linear.numel()))
+        at_once = max(1, min(self.chunk_size, _NUMBERS // max(qubo.linear.numel(), 1)))
         for start in range(0, 2**enumerated, at_once):
             stop = min(start + at_once, 2**enumerated)
             states = binary_states(enumerated, start=start, stop=stop, like=qubo.linear)
@@ -65,8 +71,8 @@ class BruteForce:
         one_each = torch.ones(*qubo.problems, 1, dtype=torch.int64, device=best.device)
         return QuboSolution(
             assignments=assignments,
-            energies=qubo.energy(assignments),
-            status=one_each * int(Status.OPTIMAL),
+            energies=qubo.energy(assignments).double(),
+            status=torch.where(qubo.rounds().unsqueeze(-1), int(Status.ROUNDED), int(Status.OPTIMAL)),
             steps=one_each * 2**enumerated,
             wall_time_s=time.perf_counter() - begin,
         )

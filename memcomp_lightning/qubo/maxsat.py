@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import torch
 from torch import Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.qubo.graph import EdgeList, Graph
-from memcomp_lightning.qubo.qubo import Qubo
+from memcomp_lightning.qubo.qubo import Qubo, wide
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,29 +119,30 @@ class WeightedMaxSat:
     def from_clauses(
         n: int,
         clauses: Sequence[Sequence[int]],
-        weights: Sequence[float],
-        offset: float = 0.0,
+        weights: Sequence[float | Fraction],
+        offset: float | Fraction = 0.0,
         dtype: torch.dtype = torch.float64,
     ) -> "WeightedMaxSat":
         """Return one problem from literals as in DIMACS: 3 is variable number 3 (the first is 1), -3 its negation.
 
         The energy is the unsatisfied weight of the clauses as given, plus ``offset``. Repeated literals count
         once, clauses with a literal and its negation are always satisfied and left out, empty clauses and
-        opposite unit clauses add to the offset.
+        opposite unit clauses add to the offset. Weights that are integers or fractions are added up without
+        rounding.
 
         Args:
             n: Number of variables, >= 1.
             clauses: One list of literals a clause.
             weights: One weight >= 0 a clause.
             offset: Added to every energy.
-            dtype: Of the weights.
+            dtype: Of the weights; of int64 the offset is an integer, too.
 
         >>> problem = WeightedMaxSat.from_clauses(3, [[1, 2], [-1], [-1, -2, 3]], [1.0, 2.0, 4.0])
         >>> problem.energy(torch.tensor([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])).tolist()
         [6.0, 0.0]
         """
         require(len(clauses) == len(weights), "number of weights", len(weights), f"{len(clauses)}, one a clause")
-        by_length: dict[int, tuple[list[list[int]], list[float]]] = {}
+        by_length: dict[int, tuple[list[list[int]], list[float | Fraction]]] = {}
         for number, (clause, weight) in enumerate(zip(clauses, weights, strict=True), start=1):
             require(weight >= 0, f"weight of clause {number}", weight, "a number >= 0")
             literals = sorted(set(clause), key=abs)
@@ -149,27 +151,35 @@ class WeightedMaxSat:
             if not any(-literal in literals for literal in literals):
                 lists = by_length.setdefault(len(literals), ([], []))
                 lists[0].append(literals)
-                lists[1].append(float(weight))
-        wanted = torch.zeros(2, n, dtype=torch.float64)  # total unit weight for x = 0 and for x = 1
+                lists[1].append(weight if isinstance(weight, (int, Fraction)) else float(weight))
+        wanted: list[list[float | Fraction]] = [[0] * n, [0] * n]  # total unit weight for x = 0 and for x = 1
         for (literal,), weight in zip(*by_length.pop(1, ([], [])), strict=True):
-            wanted[int(literal > 0), abs(literal) - 1] += weight
-        always = sum(by_length.pop(0, ([], []))[1]) + float(wanted.min(0).values.sum())
+            wanted[int(literal > 0)][abs(literal) - 1] += weight
+        for_0_and_1 = list(zip(*wanted, strict=True))
+        always = sum(by_length.pop(0, ([], []))[1]) + sum(map(min, for_0_and_1))
         pairs = _literal_block(2, *by_length.pop(2, ([], [])), dtype)
         return WeightedMaxSat(
             graph=EdgeList(n=n, pairs=pairs.variables),
             weight=pairs.weight,
             first=pairs.polarity[:, 0],
             second=pairs.polarity[:, 1],
-            unit=(wanted[1] - wanted[0]).to(pairs.weight.dtype),
-            offset=torch.tensor(offset + always, dtype=torch.float64),
+            unit=_vector([one - zero for zero, one in for_0_and_1], dtype),
+            offset=_vector([offset + always], dtype if not dtype.is_floating_point else torch.float64)[0],
             longer=tuple(_literal_block(length, *by_length[length], dtype) for length in sorted(by_length)),
         )
 
 
-def _literal_block(length: int, clauses: list[list[int]], weights: list[float], dtype: torch.dtype) -> Clauses:
+def _vector(numbers: Sequence[float | Fraction], dtype: torch.dtype) -> Tensor:
+    """Numbers as a tensor, each rounded once; integers stay what they are."""
+    return torch.tensor([float(x) if dtype.is_floating_point else int(x) for x in numbers], dtype=dtype)
+
+
+def _literal_block(
+    length: int, clauses: list[list[int]], weights: list[float | Fraction], dtype: torch.dtype
+) -> Clauses:
     """Clauses of one length as tensors."""
     literals = torch.tensor(clauses, dtype=torch.int64).reshape(len(clauses), length)
-    weight = torch.tensor(weights, dtype=dtype)
+    weight = _vector(weights, dtype)
     return Clauses(variables=literals.abs() - 1, polarity=literals.sign().to(weight.dtype), weight=weight)
 
 
@@ -220,14 +230,14 @@ def to_qubo(maxsat: WeightedMaxSat) -> Qubo:
         "Longer clauses are no QUBO without auxiliary variables: solve them with DmmSolver(field=ClauseField()).",
     )
     axes = tuple(range(-len(maxsat.graph.edge_shape), 0))
-    constant_first, constant_second = (1 + maxsat.first) / 2, (1 + maxsat.second) / 2
+    constant_first, constant_second = (1 + maxsat.first) // 2, (1 + maxsat.second) // 2
     linear = maxsat.graph.scatter(
         -maxsat.weight * maxsat.first * constant_second, -maxsat.weight * maxsat.second * constant_first
     )
-    constant = (maxsat.weight * constant_first * constant_second).double().sum(axes)
+    constant = wide(maxsat.weight * constant_first * constant_second).sum(axes)
     return Qubo(
         graph=maxsat.graph,
         coupling=maxsat.weight * maxsat.first * maxsat.second,
         linear=linear - maxsat.unit,
-        offset=maxsat.offset + constant + maxsat.unit.double().clamp(min=0).sum(-1),
+        offset=maxsat.offset + constant + wide(maxsat.unit).clamp(min=0).sum(-1),
     )

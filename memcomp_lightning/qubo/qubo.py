@@ -15,7 +15,8 @@ from memcomp_lightning.qubo.graph import EdgeList, Graph
 class Qubo:
     r"""Minimise ``offset + linear . x + \sum_{pairs} coupling x_i x_j`` over x in {0, 1}^n.
 
-    Leading axes ``*problems`` hold independent problems of one graph.
+    Leading axes ``*problems`` hold independent problems of one graph. Numbers of int64 are added up as integers:
+    ``BruteForce`` compares their sums without rounding.
 
     Attributes:
         graph: The coupled pairs and the layout of ``coupling``.
@@ -64,10 +65,22 @@ class Qubo:
         return Qubo(self.graph, self.coupling.double(), self.linear.double(), self.offset.double())
 
     def energy(self, x: Tensor) -> Tensor:
-        """Energy in float64, ``(*problems, n_states)``, of states ``x (*problems, n_states, n)`` in [0, 1]."""
-        x = x.double()
-        linear = (x @ self.linear.double().unsqueeze(-1)).squeeze(-1)
-        return self.offset.double().unsqueeze(-1) + linear + self.graph.quadratic(self.coupling.double(), x)
+        """Energy in float64, ``(*problems, n_states)``, of states ``x (*problems, n_states, n)`` in [0, 1].
+
+        Of a problem in int64 the energy is an integer, and the states are in {0, 1}.
+        """
+        linear, coupling, offset = wide(self.linear), wide(self.coupling), wide(self.offset)
+        x = x.to(linear.dtype)
+        own = (x @ linear.unsqueeze(-1)).squeeze(-1)
+        return offset.unsqueeze(-1) + own + self.graph.quadratic(coupling, x)
+
+    def rounds(self) -> Tensor:
+        """Whether the numbers are integers with sums beyond 2^53, which float64 rounds: ``(*problems,)`` bool."""
+        if self.linear.dtype == torch.int64:
+            return torch.zeros(self.problems, dtype=torch.bool, device=self.linear.device)
+        parts = [self.coupling.reshape(*self.problems, -1), self.linear, self.offset.unsqueeze(-1)]
+        numbers = torch.cat([part.double() for part in parts], dim=-1)
+        return (numbers == numbers.round()).all(-1) & (numbers.abs().sum(-1) > 2.0**53)
 
     def field(self, x: Tensor) -> Tensor:
         """Energy of x_i = 1 less energy of x_i = 0 for each variable, ``(*problems, n_states, n)``."""
@@ -145,6 +158,11 @@ class Qubo:
         return matrix
 
 
+def wide(x: Tensor) -> Tensor:
+    """In float64, or int64 as it is."""
+    return x if x.dtype == torch.int64 else x.double()
+
+
 class Status(IntEnum):
     """How one restart of a solver ended; ``advice`` says what to do about it."""
 
@@ -154,6 +172,8 @@ class Status(IntEnum):
     STILL_IMPROVING = 3
     NOT_RUN = 4
     STALLED = 5
+    INFEASIBLE = 6
+    ROUNDED = 7
 
     @property
     def advice(self) -> str:
@@ -167,6 +187,8 @@ _ADVICE = {
     Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
     Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
     Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
+    Status.INFEASIBLE: "Every state was examined: none satisfies all hard clauses; this one breaks the fewest.",
+    Status.ROUNDED: "Every state was examined, but float64 rounds sums of these numbers: another may be lower.",
     Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
 }
 
