@@ -206,7 +206,7 @@ def _table(problem: Problem, answer: Answer, wall_time_s: float) -> str:
         ("wall time", f"{wall_time_s:.2f} s"),
         *((f"{count} x {ended.name}", ended.advice) for ended, count in status.items()),
     ]
-    if problem.n <= _LONGEST_PRINTED:
+    if 0 < problem.n <= _LONGEST_PRINTED:
         rows.append(("assignment", _bits(answer.assignment)))
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name.ljust(width)}  {value}" for name, value in rows)

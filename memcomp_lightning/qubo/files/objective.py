@@ -144,14 +144,14 @@ def from_terms(
     terms = Terms(terms.kind, i, j, numbers)
     size = 9 * numbers.total  # a pair of spins: 4 x_i x_j - 2 x_i - 2 x_j + 1
     integers = None
-    if size <= LARGEST_INT64:
+    if numbers.integers.dtype != object:  # energies fit: what passes 2^63 on the way comes back by as much
         integers = _as_qubo(terms, len(used), torch.from_numpy(sign * numbers.integers))
-        size = sum(int(part.abs().sum()) for part in (integers.coupling, integers.linear, integers.offset))
     _check_size(source, numbers.exact(size))
-    if integers is None or numbers.decimals > 22:  # 10^22 is the last power that float64 holds
+    if integers is None or size > LARGEST_INT64 or numbers.decimals > 22:  # 10^22 is the last that float64 holds
         problem = _as_qubo(terms, len(used), torch.from_numpy(sign * numbers.double()))
     else:
         parts = (integers.coupling, integers.linear, integers.offset)
+        size = sum(int(part.abs().sum()) for part in parts)
         problem = Qubo(integers.graph, *(part.double() / 10**numbers.decimals for part in parts))
     said = [*remarks, *_repeated(i, j, problem), *_rounding(numbers.exact(size), size)]
     objective = Objective(name, terms, maximised)
@@ -214,7 +214,7 @@ def _rounding(size: Exact, units: int) -> list[str]:
         return []
     return [
         f"Sums reach {_short(size)}; float64 holds 2^53 = 9007199254740992 steps of the last digit. "
-        "The solver ranks by rounded sums; what is reported is counted exactly."
+        "Solvers but brute_force rank by rounded sums; what is reported is counted exactly."
     ]
 
 
@@ -280,7 +280,7 @@ def from_clauses(
     _check_size(source, soft.exact(size))
     problem = WeightedMaxSat.from_clauses(len(used), renamed, [soft.exact(unit) for unit in units])
     integers = None
-    if size <= LARGEST_INT64 and all(len(set(clause)) <= 2 for clause in renamed):
+    if sum(units) <= LARGEST_INT64 and all(len(set(clause)) <= 2 for clause in renamed):
         integers = to_qubo(WeightedMaxSat.from_clauses(len(used), renamed, units, dtype=torch.int64))
     n_empty = int((is_hard & (np.array(lengths, np.int64) == 0)).sum())
     empty = [f"{n_empty} hard clause{'s are' if n_empty > 1 else ' is'} empty: no assignment satisfies all."]
