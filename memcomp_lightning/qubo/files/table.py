@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.qubo.files.numbers import MOST_DIGITS, NUMBER, Numbers, fits
-from memcomp_lightning.qubo.files.source import Source, counts, filled, is_comment, quoted
+from memcomp_lightning.qubo.files.source import Source, counts, filled, holds, is_comment, quoted
 
 HEADER = re.compile(r"\s*(\d+)\s+(\d+)(\s|$)", re.ASCII)
 
@@ -78,7 +78,9 @@ class Table:
             return Table(source, lines, first, np.zeros((0, 3)))
         width = len(top) if len(top) in columns else columns[0]
         try:
-            rows = ["" if is_comment(line) else line for line in lines[first:]]
+            rows = lines[first:]
+            if holds(rows, "#%/cC"):
+                rows = ["" if is_comment(line) else line for line in rows]
             values = np.loadtxt(rows, ndmin=2, comments="#")
         except ValueError as error:
             for number, line in filled(lines, first):
@@ -120,8 +122,9 @@ class Table:
     def numbers(self, constant: str = "0") -> Numbers:
         """The third numbers as they stand in the file, and a constant behind them."""
         values = self.values[:, 2]
+        # Below 2^53 float64 reads a number without a point or a power of ten exactly.
         whole = constant == "0" and bool((np.abs(values) < 2**53).all())
-        if whole and (self.width == 2 or _FRACTION.isdisjoint("".join(self.lines[self.first :]))):
+        if whole and (self.width == 2 or not holds(self.lines[self.first :], ".eE")):
             return Numbers.whole(np.append(values, 0).astype(np.int64))
         rows = (line.partition("#")[0].split() for _, line in filled(self.lines, self.first))
         words = ["1" if self.width == 2 else row[-1] for row in rows]
@@ -131,7 +134,3 @@ class Table:
                 expected = f"a number that float64 can hold, of at most {MOST_DIGITS} digits"
                 raise self.source.fault(quoted(line), expected, number)
         return Numbers.read([*words, constant])
-
-
-_FRACTION = frozenset(".eE")
-"""Letters without which float64 reads a number below 2^53 exactly."""
