@@ -253,7 +253,8 @@ def _json(value: object) -> str:
 
 def _nearest(value: Exact | float) -> int | float:
     """A number that JSON has: integers whole, fractions rounded to float64."""
-    return float(value) if isinstance(value, Fraction) else value
+    whole = isinstance(value, float) and value.is_integer() and abs(value) <= 2**53
+    return int(value) if whole else float(value) if isinstance(value, Fraction) else value
 
 
 def _in_json(name: str, value: Exact | float) -> dict[str, Any]:

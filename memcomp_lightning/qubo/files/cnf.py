@@ -1,9 +1,10 @@
 """DIMACS CNF: ``p cnf n m``, then clauses that end in 0."""
 
+from memcomp_lightning.qubo.files.comments import unread
 from memcomp_lightning.qubo.files.dimacs import literals, rows
 from memcomp_lightning.qubo.files.numbers import Exact
 from memcomp_lightning.qubo.files.objective import Parsed, from_clauses
-from memcomp_lightning.qubo.files.source import Source, counts, quoted, unread
+from memcomp_lightning.qubo.files.source import Source, counts, quoted
 
 
 def parse(source: Source, maximise: bool) -> Parsed:

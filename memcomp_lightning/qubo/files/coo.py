@@ -2,19 +2,14 @@
 
 import re
 
-from memcomp_lightning.qubo.files.numbers import NUMBER, fits, number
+from memcomp_lightning.qubo.files.comments import IS, comments, constant, said
 from memcomp_lightning.qubo.files.objective import Parsed, Terms, from_terms
-from memcomp_lightning.qubo.files.source import MOST_VARIABLES, Source, comments, quoted
+from memcomp_lightning.qubo.files.source import MOST_VARIABLES, Source, quoted
 from memcomp_lightning.qubo.files.table import Table
 
-_IS = r"[\"']?\s*(?:[:=]|\bis\b)?\s*[<\"']*"
-_VARTYPE = re.compile(rf"\bvar[-_ ]?type\b{_IS}(?:dimod\.)?(?:vartype\.)?(?P<value>spin|binary)\b", re.IGNORECASE)
+_VARTYPE = re.compile(rf"\bvar[-_ ]?type\b{IS}(?:dimod\.)?(?:vartype\.)?(?P<value>spin|binary)\b", re.IGNORECASE)
 _NAMES_VARTYPE = re.compile(r"var[-_ ]?type", re.IGNORECASE)
 _SPINS = re.compile(r"\bspins?\b|\bising\b", re.IGNORECASE)
-_CONSTANT = re.compile(
-    rf"\b(?:offset|constant)\b{_IS}(?P<value>{NUMBER.pattern})(?![^\s,;}})\"']|,\d)", re.IGNORECASE | re.ASCII
-)
-_NAMES_CONSTANT = re.compile(r"\boffset\b|\bconstant\b[\"']?\s*[:=]", re.IGNORECASE)
 _OTHER = re.compile(r"[\"']?\b([A-Za-z_][\w-]*)[\"']?\s*[:=]\s*([^\s,;}]+)", re.ASCII)
 
 
@@ -25,22 +20,20 @@ def parse(source: Source, maximise: bool) -> Parsed:
     give one of their own when s becomes x: with it the energy is that of the file for every state.
     """
     lines = source.lines()
-    vartype = _said(source, lines, _VARTYPE, _NAMES_VARTYPE, _TYPES)
-    constant = _said(source, lines, _CONSTANT, _NAMES_CONSTANT, "'# offset=NUMBER', or no such word")
+    vartype = said(source, lines, _VARTYPE, _NAMES_VARTYPE, _TYPES)
+    offset = constant(source, lines)
     if vartype is None and (spins := next((entry for entry in comments(lines) if _SPINS.search(entry[1])), None)):
         raise source.fault(quoted(spins[1]), f"also a comment {_TYPES}", spins[0])
-    if constant is not None and not fits(constant):
-        raise source.fault(f"offset {quoted(constant)}", "a number that float64 can hold")
     table = Table.read(source, lines, 0, (3,))
     if not len(table.values) and vartype is None:
         raise source.fault("no entries", "lines 'i j bias'")
     i, j = table.pairs(0, MOST_VARIABLES - 1, "variables")
     kind = (vartype or "BINARY").upper()
-    numbers = table.numbers(constant or "0")
+    numbers = table.numbers(offset or "0")
     terms = Terms("spin" if kind == "SPIN" else "product", i, j, numbers)
     n = 1 + max(int(i.max(initial=-1)), int(j.max(initial=-1)))
     remarks = [] if len(table.values) else ["There are no entries: the sum is empty."]
-    remarks += [] if constant is None else [f"The offset {constant} is counted."]
+    remarks += [] if offset is None else [f"The offset {offset} is counted."]
     remarks += [
         f"Line {at}: {quoted(match[0])} stands in a comment and is not read."
         for at, text in comments(lines)
@@ -51,24 +44,3 @@ def parse(source: Source, maximise: bool) -> Parsed:
 
 
 _TYPES = "'# vartype=SPIN' or '# vartype=BINARY'"
-
-
-def _said(
-    source: Source, lines: list[str], value: re.Pattern[str], naming: re.Pattern[str], expected: str
-) -> str | None:
-    """What the comments say of one thing; None if they do not name it.
-
-    Raises:
-        ProblemFileError: A comment names it and is not understood, or two differ.
-    """
-    found: dict[object, tuple[str, int]] = {}
-    for at, text in comments(lines):
-        words = [match["value"] for match in value.finditer(text)]
-        if not words and naming.search(text):
-            raise source.fault(quoted(text), expected, at)
-        for word in words:
-            found.setdefault(number(word) if fits(word) else word.upper(), (word, at))
-    if len(found) > 1:
-        (first, at), (second, below) = list(found.values())[:2]
-        raise source.fault(f"{second}, but {first} in line {at}", "one of them", below)
-    return next(iter(found.values()))[0] if found else None

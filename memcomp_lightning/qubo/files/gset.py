@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from memcomp_lightning.qubo.files.comments import unread
 from memcomp_lightning.qubo.files.objective import Parsed, Terms, from_terms
-from memcomp_lightning.qubo.files.source import Source, unread
+from memcomp_lightning.qubo.files.source import Source
 from memcomp_lightning.qubo.files.table import Header, Table
 
 

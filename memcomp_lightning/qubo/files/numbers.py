@@ -124,15 +124,15 @@ def _decimals(denominator: int) -> int:
 
 
 def in_full(value: Exact | float) -> str:
-    """A number as text, every digit of it where it is exact, ten digits of a float.
+    """A number as text, every digit of it; of a float as many as tell it from its neighbours.
 
-    >>> in_full(18014398509482284), in_full(Fraction(194, 10)), in_full(1 / 3)
-    ('18014398509482284', '19.4', '0.3333333333')
+    >>> in_full(18014398509482284), in_full(Fraction(194, 10)), in_full(-5.0)
+    ('18014398509482284', '19.4', '-5')
     """
     if isinstance(value, int):
         return str(value)
     if isinstance(value, float):
-        return f"{value:.10g}"
+        return str(int(value)) if value.is_integer() and abs(value) <= 2**53 else repr(value)
     decimals = _decimals(value.denominator)
     digits = str(abs(int(value * 10**decimals))).rjust(decimals + 1, "0")
     return f"{'-' if value < 0 else ''}{digits[:-decimals]}.{digits[-decimals:]}"

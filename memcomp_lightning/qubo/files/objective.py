@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from memcomp_lightning.qubo.files.numbers import LARGEST_INT64, Exact, Numbers
+from memcomp_lightning.qubo.files.numbers import LARGEST_INT64, Exact, Numbers, in_full
 from memcomp_lightning.qubo.files.source import Source
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.qubo.qubo import Qubo
@@ -220,8 +220,8 @@ def _rounding(size: Exact, units: int) -> list[str]:
 
 def _short(value: Exact) -> str:
     """A total, whole or as a power of ten."""
-    text = str(math.floor(value))
-    return text if len(text) <= 25 else f"1e{len(text) - 1}"
+    text = in_full(value)
+    return text if len(text) <= 40 else f"about 1e{len(str(math.floor(value))) - 1}"
 
 
 # -------------------------------------------------------------------------------------------------------- clauses

@@ -1,9 +1,8 @@
 """qbsolv's QUBO: ``p qubo topology n n_nodes n_couplers``, then ``i i q`` and ``i j q`` counted from 0."""
 
-import re
-
+from memcomp_lightning.qubo.files.comments import constant, unread
 from memcomp_lightning.qubo.files.objective import Parsed, Terms, from_terms
-from memcomp_lightning.qubo.files.source import Source, counts, filled, is_count, quoted, unread
+from memcomp_lightning.qubo.files.source import Source, counts, filled, is_count, quoted
 from memcomp_lightning.qubo.files.table import Table
 
 
@@ -21,9 +20,10 @@ def parse(source: Source, maximise: bool) -> Parsed:
     if [n_nodes, len(i) - n_nodes] != [int(words[4]), int(words[5])]:
         found = f"{n_nodes} nodes 'i i q' and {len(i) - n_nodes} couplers 'i j q'"
         raise source.fault(found, f"{words[4]} and {words[5]}, as line {at} says")
-    remarks = (
-        [] if re.fullmatch("0|unconstrained", words[2]) else [f"The topology {quoted(words[2])} is not read."]
-    )
-    remarks += unread(lines)
-    terms = Terms("product", i, j, table.numbers())
+    offset = constant(source, lines)
+    remarks = [] if offset is None else [f"The offset {offset} is counted."]
+    if words[2] not in ("0", "unconstrained"):
+        remarks.append(f"The topology {quoted(words[2])} is not read.")
+    remarks += unread(lines, counted=("offset", "constant"))
+    terms = Terms("product", i, j, table.numbers(offset or "0"))
     return from_terms(source, "sum of q x_i x_j", n, terms, maximised=maximise, remarks=remarks)

@@ -115,30 +115,6 @@ def filled(lines: list[str], first: int = 0) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-def comments(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Number and text of what is said in comments, also of those at the end of a line."""
-    for number, line in enumerate(lines, start=1):
-        if is_comment(line):
-            if line.strip():
-                yield number, line.strip().lstrip("#%/cC ").strip()
-        elif "#" in line:
-            yield number, line.partition("#")[2].strip()
-
-
-_MEANING = re.compile(
-    r"\b(offset|constant|vartype|scale|scaling|sense|direction|maximi[sz]e|minimi[sz]e)\b[\"']?\s*[:=]\s*\S+",
-    re.IGNORECASE,
-)
-
-
-def unread(lines: list[str]) -> list[str]:
-    """A remark on each comment that looks as if it changed what the numbers mean."""
-    if not holds(lines, "=:"):
-        return []
-    found = ((number, match) for number, text in comments(lines) for match in _MEANING.finditer(text))
-    return [f"Line {number}: {quoted(match[0])} stands in a comment and is not read." for number, match in found]
-
-
 def counts(source: Source, line: int, words: list[str], *, without_variables: bool = False) -> tuple[int, int]:
     """The numbers of variables and of entries in a header; clauses alone may be without variables."""
     n, n_entries = map(int, words) if all(map(is_count, words)) else (-1, 0)

@@ -2,10 +2,11 @@
 
 from itertools import chain
 
+from memcomp_lightning.qubo.files.comments import unread
 from memcomp_lightning.qubo.files.dimacs import literals, rows
 from memcomp_lightning.qubo.files.numbers import Exact, fits, number
 from memcomp_lightning.qubo.files.objective import Parsed, from_clauses
-from memcomp_lightning.qubo.files.source import Source, counts, quoted, unread
+from memcomp_lightning.qubo.files.source import Source, counts, quoted
 
 _WEIGHT = "a weight >= 0"
 
