@@ -42,7 +42,9 @@ class BruteForce:
         """
         begin = time.perf_counter()
         graph = qubo.graph
-        enumerated = min(graph.n_first, graph.n_second) if isinstance(graph, Bipartite) else qubo.n
+        exact = qubo.linear.dtype == torch.int64
+        layered = isinstance(graph, Bipartite) and not exact
+        enumerated = min(graph.n_first, graph.n_second) if isinstance(graph, Bipartite) and layered else qubo.n
         require(
             enumerated <= self.max_variables,
             "number of variables to enumerate",
@@ -50,24 +52,23 @@ class BruteForce:
             f"at most max_variables = {self.max_variables}",
             "Use a heuristic (DmmSolver, AlternatingDescent), or raise max_variables: each one doubles the time.",
         )
-        exact = qubo.linear.dtype == torch.int64
         worst = torch.iinfo(torch.int64).max if exact else torch.inf
         best_energy = torch.full(
             qubo.problems, worst, dtype=torch.int64 if exact else torch.float64, device=qubo.linear.device
         )
-        best = qubo.linear.new_zeros(*qubo.problems, enumerated)
-        layers = _Layers(qubo) if isinstance(graph, Bipartite) else None
+        best = qubo.linear.new_zeros(*qubo.problems, enumerated, dtype=torch.float64 if exact else None)
+        layers = _Layers(qubo) if layered else None
         at_once = max(1, min(self.chunk_size, _NUMBERS // max(qubo.linear.numel(), 1)))
         for start in range(0, 2**enumerated, at_once):
             stop = min(start + at_once, 2**enumerated)
-            states = binary_states(enumerated, start=start, stop=stop, like=qubo.linear)
+            states = binary_states(enumerated, start=start, stop=stop, like=best).to(qubo.linear.dtype)
             every = states.expand(*qubo.problems, *states.shape)
             energies, index = (qubo.energy(every) if layers is None else layers.lowest(states)).min(-1)
-            best = torch.where((energies < best_energy).unsqueeze(-1), states[index], best)
+            best = torch.where((energies < best_energy).unsqueeze(-1), states[index].to(best.dtype), best)
             best_energy = torch.minimum(energies, best_energy)
         if layers is not None:
             best = layers.completed(best)
-        assignments = best.unsqueeze(-2)
+        assignments = best.unsqueeze(-2).to(qubo.linear.dtype)
         one_each = torch.ones(*qubo.problems, 1, dtype=torch.int64, device=best.device)
         return QuboSolution(
             assignments=assignments,

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from fractions import Fraction
 
 import pytest
 import torch
@@ -533,3 +534,25 @@ def test_error_names_shape_and_allowed(change, message):
 def test_error_names_shape_of_a_matrix_that_is_not_square(shape):
     with pytest.raises(SettingError, match=r"matrix shape = .* expected .*problems, n, n"):
         Qubo.from_matrix(torch.zeros(shape))
+
+
+# ------------------------------------------------------------------------------------------------ without rounding
+
+
+def test_weights_that_are_integers_or_fractions_add_up_without_rounding():
+    clauses, weights = [[1]] * 101 + [[-1]], [2**54, *[3] * 100, 2**54 + 299]
+    problem = WeightedMaxSat.from_clauses(1, clauses, weights)
+    assert problem.unit.tolist() == [1.0]
+    thirds = WeightedMaxSat.from_clauses(1, [[1]] * 3 + [[-1]], [Fraction(1, 3)] * 3 + [1])
+    assert thirds.unit.tolist() == [0.0]
+    assert thirds.offset.item() == 1.0
+
+
+def test_integers_stay_integers_and_have_the_energies_of_the_clauses():
+    clauses, weights = [[1, 2], [-1, 2], [1, -2], [-1, -2], [2], [-3], []], [2**60, 3, 2**59 + 1, 5, 7, 11, 13]
+    qubo = to_qubo(WeightedMaxSat.from_clauses(3, clauses, weights, dtype=torch.int64))
+    assert {part.dtype for part in (qubo.coupling, qubo.linear, qubo.offset)} == {torch.int64}
+    for x in itertools.product((0, 1), repeat=3):
+        false = [not any((x[abs(q) - 1] == 1) == (q > 0) for q in clause) for clause in clauses]
+        expected = sum(w for w, is_false in zip(weights, false, strict=True) if is_false)
+        assert qubo.energy(torch.tensor([x])).tolist() == [expected]

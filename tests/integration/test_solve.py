@@ -12,7 +12,7 @@ import torch
 from running import Outcome, launch
 
 import memcomp_lightning
-from memcomp_lightning.qubo import read_problem
+from memcomp_lightning.qubo import FORMATS, read_problem
 
 Solve = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"
@@ -29,6 +29,7 @@ def files(tmp_path: Path) -> None:
     (tmp_path / "pairs.wcnf").write_text("p wcnf 3 4 10\n10 1 2 0\n2 -1 0\n3 -2 0\n1 3 0\n")
     (tmp_path / "triples.cnf").write_text("p cnf 3 2\n1 2 3 0\n-1 -2 -3 0\n")
     np.savez(tmp_path / "rbm.npz", weight=np.ones((2, 3)), b=-np.ones(3), c=np.ones(2))
+    (tmp_path / "three.txt").write_text("3 1 1\n1 2 1\n")
     (tmp_path / "bad.txt").write_text("3 2\n1 2 1\n1 4 1\n")
 
 
@@ -94,6 +95,59 @@ def test_table_says_what_a_person_wants_to_know(memcomp_solve: Solve) -> None:
         assert part in outcome.out
 
 
+def test_integers_are_printed_whole(memcomp_solve: Solve) -> None:
+    Path("big.wcnf").write_text(f"{2**54} 1 0\nh -1 0\n" + "3 1 0\n" * 100)
+    outcome = memcomp_solve("problem=big.wcnf", "solver=brute_force", FAST[2])
+    assert outcome.status == 0, outcome.err
+    assert "Note: Sums reach" in outcome.out, "what float64 does not hold is said"
+    assert outcome.out.index("2^53") < outcome.out.index("weight of unsatisfied"), "before the answer"
+    for part in (f"soft clauses  {2**54 + 300}  (minimise)", f"{2**54 + 300}  (reached by 1 of 1", "1 x OPTIMAL"):
+        assert part in outcome.out
+    assert json.loads(Path("run/solution.json").read_text())["objective"]["value"] == 2**54 + 300
+
+
+def test_a_broken_hard_clause_is_no_solution(memcomp_solve: Solve) -> None:
+    Path("none.wcnf").write_text("h 1 0\nh -1 0\n4 -2 0\nh 2 1 0\n")
+    outcome = memcomp_solve("problem=none.wcnf", "solver=brute_force", FAST[2])
+    assert "1 unsatisfied: this is no solution" in outcome.out
+    assert "1 x INFEASIBLE" in outcome.out
+    assert "OPTIMAL" not in outcome.out
+
+
+@pytest.mark.parametrize("solver", ["dmm_recorded", "brute_force", "alternating_descent"])
+def test_no_variables(memcomp_solve: Solve, solver: str) -> None:
+    Path("empty.cnf").write_text("p cnf 0 0\n")
+    outcome = memcomp_solve("problem=empty.cnf", f"solver={solver}", FAST[2])
+    assert outcome.status == 0, outcome.err
+    assert "1 x OPTIMAL" in outcome.out
+    found = json.loads(Path("run/solution.json").read_text())
+    assert (found["objective"]["value"], found["assignment"]) == (0, [])
+
+
+def test_unused_variables_are_free(memcomp_solve: Solve) -> None:
+    Path("sparse.coo").write_text("0 200000 -1\n200000 200000 -2\n")
+    outcome = memcomp_solve("problem=sparse.coo", *FAST)
+    assert outcome.status == 0, outcome.err
+    assert "Note: 199999 of the variables are not used: they cost nothing, and are reported as 0." in outcome.out
+    found = json.loads(Path("run/solution.json").read_text())
+    assert found["problem"]["n_unused_variables"] == 199_999
+    assert len(found["assignment"]) == 200_001
+    assert [i for i, bit in enumerate(found["assignment"]) if bit] == [0, 200_000]
+
+
+def test_memory_is_said_before_solving(memcomp_solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("path.coo").write_text("".join(f"{i} {i + 1} -1\n" for i in range(50)))
+    restarts = ["solver=alternating_descent", "solver.n_restarts=10", "solver.max_sweeps=1", FAST[2]]
+    monkeypatch.setattr("memcomp_lightning.cli.solve._NUMBERS_EACH", 135_000)
+    outcome = memcomp_solve("problem=path.coo", *restarts)
+    assert "Note: The solver needs about 1 GiB of memory." in outcome.out
+    monkeypatch.setattr("memcomp_lightning.cli.solve._installed", lambda: float(2**29))
+    outcome = memcomp_solve("problem=path.coo", *restarts)
+    assert outcome.status == 2
+    for part in ("path.coo: 51 variables, 50 couplings", "n_restarts = 10 needs about 1 GiB", "fewer restarts"):
+        assert part in outcome.err
+
+
 def test_long_assignments_stay_in_the_file(memcomp_solve: Solve) -> None:
     Path("long.txt").write_text("101 1\n1 101 1\n")
     outcome = memcomp_solve("problem=long.txt", *FAST)
@@ -152,6 +206,7 @@ REFUSED = {
     "problem=ring.txt +keep=1": ["setting = 'keep'", "'problem'"],
     "problem=ring.txt model=dbn": ["'model'"],
     "problem=ring.txt hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
+    "problem=three.txt": ["three.txt, line 1: found '3 1 1'", "format=gset", "format=coo"],
     "problem=triples.cnf solver=brute_force": ["longest clause = 3", "at most 2 literals"],
     "problem=ring.txt solver.max_steps=1000000000": ["solver.record.every = 8", "at least 33", "solver=dmm"],
     "-m problem=ring.txt,bad.txt": ["bad.txt, line 3", "(job problem=bad.txt)"],
@@ -181,6 +236,9 @@ def test_help_has_examples_every_format_and_every_solver(memcomp_solve: Solve) -
     assert outcome.status == 0
     for part in ("memcomp-solve problem=G1.txt", "maximise: false", "beasley  .sparse", "p wcnf n m top"):
         assert part in outcome.out
+    for name, row in FORMATS.items():
+        assert f"\n  {name.ljust(8)} " in outcome.out
+        assert all(suffix in outcome.out for suffix in row.suffixes)
     for solver in sorted(path.stem for path in (CONF / "solver").glob("*.yaml")):
         assert solver in outcome.out
     assert left_behind() == set()
