@@ -1,15 +1,42 @@
-"""Shapes are checked, the global random streams are watched, one thread computes."""
+"""Shapes are checked, the global random streams are watched, one thread computes.
+
+Two variables of the environment, which ``portability.sh`` sets:
+
+* ``MEMCOMP_SEED``: other random streams than usual, in this process. No test may pass by luck.
+* ``MEMCOMP_THREADS``: of torch and of the DMM, usually 1.
+"""
 
 import contextlib
+import dataclasses
+import functools
 import importlib
 import inspect
+import os
+import subprocess
 import sys
+from pathlib import Path
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
 from beartype import beartype
 from jaxtyping import AbstractArray, install_import_hook
+
+from memcomp_lightning import rng
+
+if SEED := os.environ.get("MEMCOMP_SEED"):
+    usual_stream = rng.stream
+
+    @functools.wraps(usual_stream)
+    def stream(seed, *args, **kwargs):
+        return usual_stream(f"{SEED}/{seed}", *args, **kwargs)
+
+    rng.stream = stream  # before another module takes it from there
+
+
+def is_shape(hint):
+    return inspect.isclass(hint) and issubclass(hint, AbstractArray)
 
 
 def check_shapes(function):
@@ -18,13 +45,24 @@ def check_shapes(function):
     The rest is mypy's: protocols cannot be checked at run time, and a misspelt option shall meet the
     package's own error message.
     """
-    function.__annotations__ = {
-        name: hint
-        for name, hint in function.__annotations__.items()
-        if inspect.isclass(hint) and issubclass(hint, AbstractArray)
-    }
+    function.__annotations__ = {name: hint for name, hint in function.__annotations__.items() if is_shape(hint)}
     return beartype(function)
 
+
+def jaxtyped_where_there_are_shapes(*, typechecker):
+    """The decorator of the hook, for what has a shape to check: around the rest it would take most of the time."""
+
+    def decorate(decorated):
+        if dataclasses.is_dataclass(decorated):
+            hints = [field.type for field in dataclasses.fields(decorated)]
+        else:
+            hints = getattr(decorated, "__annotations__", {}).values()
+        return jaxtyped(decorated, typechecker=typechecker) if any(map(is_shape, hints)) else decorated
+
+    return decorate
+
+
+jaxtyped, jaxtyping.jaxtyped = jaxtyping.jaxtyped, jaxtyped_where_there_are_shapes
 
 HOOKED = [f"memcomp_lightning.{name}" for name in ("models", "objective", "qubo", "dmm", "samplers", "likelihood")]
 
@@ -34,25 +72,21 @@ with install_import_hook(HOOKED, "memcomp_lightning_tests.check_shapes"):
     for hooked in HOOKED:
         importlib.import_module(hooked)
 
-torch.set_num_threads(1)
+torch.set_num_threads(int(os.environ.get("MEMCOMP_THREADS", "1")))
 
 # A project of its own, whose tests run where it is installed: integration/test_downstream.py.
 collect_ignore = ["downstream"]
+
+COMPILE = Path(__file__).with_name("compile_kernels.py")
 
 
 def pytest_sessionstart(session):
     """Compile the kernels before there are several workers, each of which would; later runs load them."""
     options = session.config.option
     if getattr(options, "numprocesses", None) and not options.collectonly:
-        from memcomp_lightning import rng
-        from memcomp_lightning.dmm import DmmSolver
-        from memcomp_lightning.likelihood import log_partition_function
-        from memcomp_lightning.qubo import Qubo, from_model
-        from memcomp_lightning.testing.conformance import small_rbm
-
-        log_partition_function(small_rbm())
-        for problem in (from_model(small_rbm()), Qubo.from_matrix(torch.ones(2, 2))):
-            DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=rng.stream(0, "compile"))
+        compilers = [subprocess.Popen([sys.executable, COMPILE, part]) for part in ("lanes", "others")]
+        if any([compiler.wait() for compiler in compilers]):  # a list, to wait for both
+            pytest.exit("the kernels do not compile", returncode=1)
 
 
 @contextlib.contextmanager

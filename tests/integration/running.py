@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+THREADS = os.environ.get("MEMCOMP_THREADS", "1")
+"""Of every process, as in this one: the last bits depend on their number."""
+
 FAST = ["pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"]
 
 # D-Wave's own mock of a Pegasus annealer, with a few qubits missing, in place of the service.
@@ -25,11 +28,11 @@ class Outcome:
 
 
 def launch(*arguments: str, folder: Path, command: str = "train") -> "subprocess.Popen[str]":
-    """Start a command as a process of its own; one thread, on which the last bits depend."""
+    """Start a command as a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", f"memcomp_lightning.cli.{command}", *arguments],
         cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": THREADS},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
