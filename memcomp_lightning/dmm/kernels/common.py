@@ -80,3 +80,10 @@ def keep_if_new(x, best):
         new |= best[i] != x[i]
         best[i] = x[i]
     return new
+
+
+@njit(nogil=True, cache=True)
+def copy(source, target):
+    """Copy numbers one by one; an assignment of slices would take seconds to compile, for the words of its error."""
+    for i in range(source.size):
+        target[i] = source[i]

@@ -23,6 +23,7 @@ from memcomp_lightning.dmm.kernels.common import (
     TINY,
     clause,
     clause_rates,
+    copy,
     keep_if_new,
     uniform,
 )
@@ -208,7 +209,7 @@ def local_fields(digital, linear, pairs, x, field, true):
     """Write the local fields of one restart from scratch; return its energy."""
     coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
     half, energy = F32(0.5), 0.0
-    field[:] = linear
+    copy(linear, field)
     for e in range(coupling.size):
         field[pairs[e, 0]] += coupling[e] * x[pairs[e, 1]]
         field[pairs[e, 1]] += coupling[e] * x[pairs[e, 0]]
@@ -299,7 +300,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         if stop[0] != 0:
             return
         p, b = item // n_blocks, item % n_blocks
-        found_at[p, b], last[p, b] = integrate(
+        found, ended = integrate(
             (kind, pairs, weight[p], polarity[p], unit[p], (variables, longer_polarity, longer_weight[p])),
             (
                 offsets,
@@ -322,6 +323,8 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
             times[p, b],
             states[p, b],
         )
+        copy(found, found_at[p, b])
+        copy(ended, last[p, b])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH)
@@ -405,9 +408,9 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                     if keep_if_new(x[k], best[k]) or step == 0:
                         found_at[k] = step
                 if quench_every > 0:
-                    tried[:] = x[k]
-                    tried_field[:] = field[k]
-                    tried_true[:] = true[k]
+                    copy(x[k], tried)
+                    copy(field[k], tried_field)
+                    copy(true[k], tried_true)
                     reached = energy[k] + quench(digital, tried, tried_field, tried_true)
                     if reached < lowest[k]:
                         lowest[k] = reached

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.dmm.kernels.common import BOND, F32
+from memcomp_lightning.dmm.kernels.common import BOND, F32, copy
 from memcomp_lightning.dmm.scaling import POWER_ITERATIONS, SIZE_EXPONENT, SMALLEST_RATIO
 
 
@@ -46,24 +46,27 @@ def prepare(kind, width, height, coupling, linear, weight, unit, scalars, digita
             fields[p, at] = linear[p, i] / power_of_two
         if kind == BOND:
             _add_both(coupling[p], sums)
-            own[:] = -2.0 * linear[p] - sums
+            for i in range(n):
+                own[i] = -2.0 * linear[p, i] - sums[i]
         else:
             _unit_clauses(coupling[p], linear[p], own)
             largest = max(_largest(coupling[p].ravel()), _largest(own))
         largest = largest if largest > 0 else 1.0
-        scaled[:] = coupling[p] / largest
-        own[:] = own / largest
+        copy(coupling[p].ravel(), scaled.ravel())
+        _divide(scaled, own, largest)
         _add_both(scaled * scaled, sums)
         norm, n_coupled = _or_one(math.sqrt(_mean_of_used(sums))), max((sums > 0).sum(), 1)
         scalars[p, 2] = _effective_degree(scaled, sums)
-        scaled[:] = scaled / norm
-        own[:] = own / norm
+        _divide(scaled, own, norm)
         scalars[p, 0] = (n_coupled / 200) ** -SIZE_EXPONENT * math.sqrt(n_coupled / n)
         scalars[p, 1] = 1.0
         if kind == BOND:
             collective = _collective_mode(scaled)
-            scaled[:] = scaled * -collective
-            own[:] = own * collective
+            for i in range(n):
+                own[i] *= collective
+            for i in range(n_second):
+                for j in range(n_first):
+                    scaled[i, j] *= -collective
         _add_both(np.abs(scaled), sums)
         if kind == BOND:
             scalars[p, 0], scalars[p, 1] = 1.0, _or_one(_mean_of_used(sums))
@@ -88,13 +91,23 @@ def _way(i, j, n_second, n_first):
 def _unit_clauses(coupling, linear, unit):
     """The unit clauses of ``qubo.from_qubo``."""
     n_second, n_first = coupling.shape
-    unit[:] = -linear
+    for i in range(unit.size):
+        unit[i] = -linear[i]
     for i in range(n_second):
         for j in range(n_first):
             size, second = abs(coupling[i, j]), -_way(i, j, n_second, n_first)
             first = -second if coupling[i, j] < 0 else second
             unit[j] -= size * first * (1 + second) / 2
             unit[n_first + i] -= size * second * (1 + first) / 2
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _divide(matrix, values, divisor):
+    for i in range(values.size):
+        values[i] /= divisor
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] /= divisor
 
 
 @njit(nogil=True, cache=True)

@@ -22,6 +22,7 @@ from memcomp_lightning.dmm.kernels.common import (
     TINY,
     clause,
     clause_rates,
+    copy,
     keep_if_new,
     uniform,
 )
@@ -335,8 +336,8 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
                 if keep_if_new(x, best) or step == 0:
                     found_at = step
             if quench_every > 0:
-                tried[:] = x
-                tried_field[:] = field
+                copy(x, tried)
+                copy(field, tried_field)
                 reached = energy + quench(n_first, n_second, coupling, transposed, tried, tried_field, found)
                 if reached < lowest:
                     lowest = reached
