@@ -1,41 +1,60 @@
-# make train: train on the digits that ship with scikit-learn.   make test: everything CI checks.   make docs: the site.
-# make notebooks: Jupyter.
+# make train      train on the digits that ship with scikit-learn: a first run
+# make check      linters, types, unit and exact tests: while you work
+# make test       the whole suite: what CI runs
+# make lint       linters and types alone
+# make docs       the site, into site/
+# make notebooks  the notebooks in Jupyter
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: train test lint docs notebooks
+.PHONY: train check test lint lint-but-types types unit-and-exact whole-suite docs notebooks
 
 train: $(VENV)/.installed
 	$(BIN)/memcomp-train data=digits sampler=dmm_qubo
 
-# A thread a worker.
-test: export OMP_NUM_THREADS = 1
-test: $(VENV)/.installed-dev lint
-	$(BIN)/pytest
+# mypy needs one processor for as long as the kernels are compiled on the other.
+check: lint-but-types
+	@$(MAKE) --no-print-directory --jobs 2 types unit-and-exact
 
-# Opens the text notebooks in Jupyter; what is changed there goes back into the text.
-notebooks: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[notebooks]'
-	$(BIN)/jupytext --to ipynb --update notebooks/*.py
-	$(BIN)/jupyter lab notebooks
+test: lint-but-types
+	@$(MAKE) --no-print-directory --jobs 2 types whole-suite
 
-lint: $(VENV)/.installed-dev
+lint: lint-but-types types
+
+lint-but-types: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+types: $(VENV)/.installed-dev
+	$(BIN)/mypy
+
+# A thread a worker.
+unit-and-exact whole-suite: export OMP_NUM_THREADS = 1
+unit-and-exact: $(VENV)/.installed-dev
+	$(BIN)/pytest tests/exact tests/unit
+
+whole-suite: $(VENV)/.installed-dev
+	$(BIN)/pytest
 
 # Strictly: a broken link or an unknown name ends it. The variable silences an advertisement.
 docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
+# Opens the text notebooks in Jupyter; what is changed there goes back into the text.
+notebooks: $(VENV)/.installed
+	$(PIP) --editable '.[notebooks]'
+	$(BIN)/jupytext --to ipynb --update notebooks/*.py
+	$(BIN)/jupyter lab notebooks
+
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	$(PIP) --editable .
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(PIP) --editable '.[dev]'
 	touch $@ $(VENV)/.installed

@@ -1,6 +1,6 @@
 """Compile the kernels before the tests, half of them in each of two processes; what is compiled is kept on disk.
 
-    python tests/compile_kernels.py lanes
+python tests/compile_kernels.py lanes
 """
 
 import sys

@@ -9,6 +9,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from running import Outcome, launch
 
+import memcomp_lightning
 from memcomp_lightning.cli import solve, sweep, train
 
 RunCommand = Callable[[str, Callable[[], None], tuple[str, ...]], Outcome]
@@ -54,6 +55,16 @@ def start_process(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
         return launch(*arguments, folder=tmp_path)
 
     return start
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Our wheel, by way of the source archive, as an index or a packager would build it."""
+    folder, root = tmp_path_factory.mktemp("wheel"), Path(memcomp_lightning.__file__).parents[1]
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, root]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.whl"))
 
 
 @pytest.fixture

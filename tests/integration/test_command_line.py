@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from running import FAST, MOCK_QPU, Outcome
+from running import FAST, LOGGED, MOCK_QPU, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.cli.build import build
@@ -25,7 +25,7 @@ def options(group: str) -> list[str]:
 @pytest.mark.parametrize("sampler", [name for name in options("sampler") if name != "exact"])
 def test_every_sampler_trains(memcomp_train: Run, sampler: str) -> None:
     qpu = [MOCK_QPU] if sampler == "dwave_qpu" else []
-    outcome = memcomp_train(f"sampler={sampler}", *qpu, *FAST, "solver.n_restarts=3", "hydra.run.dir=run")
+    outcome = memcomp_train(f"sampler={sampler}", *qpu, *LOGGED, "solver.n_restarts=3", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     assert "pretrain layer 2" in outcome.out
     assert "tensorboard --logdir 'run'" in outcome.out
@@ -72,7 +72,7 @@ def test_every_experiment_runs_fast(memcomp_train: Run, experiment: str) -> None
 def test_every_logger_and_set_of_callbacks(memcomp_train: Run, logger: str, callbacks: str) -> None:
     # Small enough to enumerate, which diagnostics_exact does.
     settings = ["sampler=cd", "model.hidden_sizes=[7]", *FAST, "hydra.run.dir=run"]
-    outcome = memcomp_train(f"logger={logger}", f"callbacks={callbacks}", *settings)
+    outcome = memcomp_train(*settings, f"logger={logger}", f"callbacks={callbacks}")
     assert outcome.status == 0, outcome.err
     assert Path("run/csv/version_0/metrics.csv").exists() == (logger in ("csv", "both"))
     assert any(Path("run").glob("events.out.*")) == (logger in ("tensorboard", "both"))

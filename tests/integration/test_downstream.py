@@ -9,18 +9,21 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 import memcomp_lightning
 
-pytestmark = pytest.mark.xdist_group("downstream")
+pytestmark = pytest.mark.xdist_group("wheel")  # one worker, one wheel, one environment
 
 ROOT = Path(memcomp_lightning.__file__).parents[1]
 HYDRA = "1.4.0rc3"
-OTHER_VERSIONS = r"(hydra-.*|omegaconf|antlr4-.*|optuna)=="
-"""Lines of constraints.txt that belong to Hydra 1.3, with which all other tests run."""
+OTHER_VERSIONS = r"hydra-.*|omegaconf|antlr4-.*|optuna"
+"""What belongs to Hydra 1.3, with which all other tests run."""
 
 FAST = ["pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"]
 
@@ -38,8 +41,41 @@ def run(*command: str | Path, folder: Path, status: int = 0) -> str:
 def constraints(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines = (ROOT / "constraints.txt").read_text().splitlines(keepends=True)
     path = tmp_path_factory.mktemp("constraints") / "constraints.txt"
-    path.write_text("".join(line for line in lines if not re.match(OTHER_VERSIONS, line, re.IGNORECASE)))
+    path.write_text("".join(line for line in lines if not re.match(f"({OTHER_VERSIONS})==", line)))
     return path
+
+
+@pytest.fixture(scope="session")
+def requirements(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what our package requires without its extras, by links: installing torch takes long."""
+    folder, seen = tmp_path_factory.mktemp("requirements"), set()
+    required = ["memcomp-lightning", "pytest"]
+    while required:
+        requirement = Requirement(required.pop())
+        name = canonicalize_name(requirement.name)
+        if re.fullmatch(OTHER_VERSIONS, name) or (name, *requirement.extras) in seen:
+            continue
+        seen.add((name, *requirement.extras))
+        installed = distribution(name)
+        for text in installed.requires or []:
+            marker = Requirement(text).marker
+            if marker is None or any(marker.evaluate({"extra": extra}) for extra in (*requirement.extras, "")):
+                required.append(text)
+        if name != "memcomp-lightning":
+            for entry in {file.parts[0] for file in installed.files or []} - {"..", "__pycache__"}:
+                if not entry.endswith(".pth") and not (folder / entry).is_symlink():
+                    (folder / entry).symlink_to(installed.locate_file(entry))
+    return folder
+
+
+def new_environment(folder: Path, *packages: str | Path, below: list[Path], constraints: Path) -> Path:
+    """Interpreter of an environment with some packages, in which those of the folders ``below`` are seen."""
+    run(sys.executable, "-m", "venv", "--without-pip", folder, folder=folder.parent)
+    python, version = folder / "bin/python", "python{}.{}".format(*sys.version_info)
+    (folder / "lib" / version / "site-packages/below.pth").write_text("\n".join(map(str, below)))
+    pip = [sys.executable, "-m", "pip", "--python", python]
+    run(*pip, "install", "--no-compile", "-c", constraints, *packages, folder=folder)
+    return python
 
 
 @pytest.fixture(scope="session")
@@ -49,29 +85,26 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def python(project: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Interpreter of an environment with the wheel, the project and what they require."""
+def python(
+    wheel: Path, project: Path, requirements: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Interpreter of an environment with the wheel, the project and what they require; pip sees to it."""
     folder = tmp_path_factory.mktemp("environment")
-    run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", folder, ".", folder=ROOT)
     run(sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", folder, ".", folder=project)
-    run(sys.executable, "-m", "venv", folder / "venv", folder=folder)
-    python = folder / "venv/bin/python"
-    packages = [f"hydra-core=={HYDRA}", "pytest", *folder.glob("*.whl")]
-    run(python, "-m", "pip", "install", "--no-compile", "-c", constraints, *packages, folder=folder)
-    return python
+    packages = [f"hydra-core=={HYDRA}", "pytest", wheel, *folder.glob("*.whl")]
+    return new_environment(folder / "venv", *packages, below=[requirements], constraints=constraints)
 
 
 @pytest.fixture(scope="session")
-def python_with_plugins(python: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def python_with_plugins(
+    python: Path, requirements: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """A second environment on top of it, with the extra for sweeps."""
-    folder = tmp_path_factory.mktemp("plugins")
-    run(sys.executable, "-m", "venv", folder / "venv", folder=folder)
-    packages = "lib/python{}.{}/site-packages".format(*sys.version_info)
-    (folder / "venv" / packages / "below.pth").write_text(f"{python.parents[1] / packages}\n")
-    python = folder / "venv/bin/python"
+    site_packages = python.parents[1] / "lib/python{}.{}/site-packages".format(*sys.version_info)
     plugins = [f"hydra-{name}=={HYDRA}" for name in ("joblib-launcher", "optuna-sweeper", "submitit-launcher")]
-    run(python, "-m", "pip", "install", "-c", constraints, "memcomp-lightning[sweep]", *plugins, folder=folder)
-    return python
+    packages = ["memcomp-lightning[sweep]", *plugins]
+    folder = tmp_path_factory.mktemp("plugins") / "venv"
+    return new_environment(folder, *packages, below=[site_packages, requirements], constraints=constraints)
 
 
 def test_it_is_the_wheel_with_hydra_1_4(python: Path, tmp_path: Path) -> None:

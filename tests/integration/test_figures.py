@@ -12,7 +12,7 @@ from typing import Any
 import hydra
 import pytest
 import torch
-from running import Outcome
+from running import QUIET, Outcome
 from test_command_line import options
 
 from memcomp_lightning.cli import figures, report
@@ -29,6 +29,7 @@ SMALL = [
     "solver.max_steps=20",
     "solver.n_restarts=3",
 ]
+SINGLE = [*QUIET, *[setting for setting in SMALL if not setting.startswith("figure")]]
 NO_CONTROLS = "figure/curves=none"
 
 
@@ -61,7 +62,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     found = records()
     for name in SAMPLERS:
         single = memcomp_train(
-            *[o for o in SMALL if not o.startswith("figure")],
+            *SINGLE,
             f"sampler={name}",
             "pretrain.iterations=3",
             "finetune.iterations=2",
@@ -101,9 +102,8 @@ def test_a_replica_trained_jointly_is_the_single_run(memcomp_train: Run, sampler
     figure = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[3]", "figure.seeds=[5]", curve]
     outcome = memcomp_train(*figure, "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
-    settings = [o for o in SMALL if not o.startswith("figure")]
     lengths = ["pretrain.iterations=3", "finetune.iterations=2", "seed=5"]
-    single = memcomp_train(*settings, *joint, *lengths, "hydra.run.dir=single")
+    single = memcomp_train(*SINGLE, *joint, *lengths, "hydra.run.dir=single")
     assert single.status == 0, single.err
     result = json.loads(Path("single/result.json").read_text())
     record = only(records(), "joint", 3)
@@ -114,8 +114,7 @@ def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run, joblib_
     """As a user would ask Hydra for Fig. 4: samplers, pretraining lengths and seeds, by the joblib launcher."""
     single = ["data=digits", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=3"]
     sweep = ["-m", "sampler=cd,dmm_qubo", "pretrain.iterations=range(1,3)", "seed=range(2)"]
-    quiet = ["callbacks=minimal", "logger=none", *joblib_launcher]
-    outcome = memcomp_train(*sweep, *single, *quiet, "hydra.sweep.dir=sweep")
+    outcome = memcomp_train(*sweep, *single, *QUIET, *joblib_launcher, "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.err
     figure = [
         "experiment=figure4",
@@ -150,6 +149,7 @@ def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train:
     outcome = memcomp_train("experiment=figure4", *small, NO_CONTROLS, curve, *drop, "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     single = memcomp_train(
+        *QUIET,
         *[o for o in small if not o.startswith("figure")],
         f"control={control}",
         f"pretrain.iterations={iterations}",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from running import FAST, Outcome
+from running import FAST, LOGGED, THREADS, Outcome
 
 Run = Callable[..., Outcome]
 
@@ -41,7 +41,7 @@ def train(
     done = subprocess.run(
         [sys.executable, "-m", "memcomp_lightning.cli.train", *arguments],
         cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(place), **environment},
+        env={**os.environ, "OMP_NUM_THREADS": THREADS, "PYTHONPATH": str(place), **environment},
         preexec_fn=before,
         capture_output=True,
         text=True,
@@ -52,11 +52,11 @@ def train(
 
 def test_without_tensorboard_the_error_says_what_to_install_or_choose(tmp_path: Path) -> None:
     absent = ("tensorboard", "tensorboardX")
-    refused = train(tmp_path, "sampler=cd", *FAST, without=absent)
+    refused = train(tmp_path, "sampler=cd", *LOGGED, without=absent)
     assert refused.status == 2
     assert "TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
     assert "Traceback" not in refused.err
-    trained = train(tmp_path, "sampler=cd", "logger=csv", *FAST, "hydra.run.dir=run", without=absent)
+    trained = train(tmp_path, "sampler=cd", *LOGGED, "logger=csv", "hydra.run.dir=run", without=absent)
     assert trained.status == 0, trained.err
     assert "Run folder:   run" in trained.out
     assert "TensorBoard:" not in trained.out
@@ -96,7 +96,7 @@ def test_a_misspelt_group_or_option_suggests_the_nearest(memcomp_train: Run, typ
 
 
 def test_a_terminal_without_colours_gets_none(tmp_path: Path) -> None:
-    outcome = train(tmp_path, "sampler=cd", *FAST, TERM="dumb", NO_COLOR="1")
+    outcome = train(tmp_path, "sampler=cd", *LOGGED, TERM="dumb", NO_COLOR="1")
     assert outcome.status == 0, outcome.err
     assert "\x1b" not in outcome.out + outcome.err
 

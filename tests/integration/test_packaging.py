@@ -13,6 +13,8 @@ import yaml
 
 import memcomp_lightning
 
+pytestmark = pytest.mark.xdist_group("wheel")  # one worker, one wheel
+
 ROOT = Path(memcomp_lightning.__file__).parents[1]
 
 DOWNSTREAM = """
@@ -37,14 +39,6 @@ def run(*command: str, folder: Path, path: Path | None = None) -> str:
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    # By way of the source archive, as an index or a packager would build it.
-    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), ".", folder=ROOT)
-    return next(folder.glob("*.whl"))
 
 
 @pytest.fixture(scope="module")

@@ -1,78 +1,79 @@
 """A killed process goes on to the same bits."""
 
+import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from running import launch
+from running import Outcome, launch
 
-Start = Callable[..., "subprocess.Popen[str]"]
+Run = Callable[..., Outcome]
 RUN = [
     "sampler=mode_assisted_pcd",
     "sampler.schedule.p_max=0.5",
     "pretrain=centred",
     "sampler.inner.n_chains=11",
-    "pretrain.iterations=20",
+    "pretrain.iterations=4",
     "pretrain.batch_size=300",
-    "finetune.iterations=40",
+    "finetune.iterations=4",
     "checkpoint_every=1",
+    *[f"+callbacks.{stage}.kill={{_target_:killing.Kill,stage:{stage}}}" for stage in ("pretrain", "finetune")],
+    "hydra.run.dir=run",
 ]
 
-
-def wait_for_epoch(process: "subprocess.Popen[str]", checkpoint: Path, epoch: int) -> None:
-    """Until the process has written a checkpoint of this epoch or a later one."""
-    deadline = time.monotonic() + 100
-    while time.monotonic() < deadline:
-        assert process.poll() is None, process.communicate()
-        try:
-            if torch.load(checkpoint, weights_only=True)["epoch"] >= epoch:
-                return
-        except FileNotFoundError:
-            time.sleep(0.01)
-    raise AssertionError(f"{checkpoint} never came to epoch {epoch}")
+pytestmark = pytest.mark.xdist_group("resume")  # one worker, one uninterrupted run
 
 
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("uninterrupted")
-    process = launch(*RUN, "hydra.run.dir=run", folder=folder)
-    _, err = process.communicate()
-    assert process.returncode == 0, err
-    return folder / "run"
+def killed(folder: Path, stage: str, epoch: int, name: str) -> "subprocess.CompletedProcess[str]":
+    """A run that gets a signal at the start of an epoch; the checkpoint of the epoch before is there."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("MEMCOMP_KILL", f"{stage}/{epoch}/{name}")
+        environment.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        process = launch(*RUN, folder=folder)
+        out, err = process.communicate(timeout=200)
+    return subprocess.CompletedProcess(RUN, process.returncode, out, err)
 
 
-@pytest.mark.xdist_group("resume")  # one worker, one uninterrupted run
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return {
+        f"{stage} {name}": tensor
+        for stage in ("pretrain", "finetune")
+        for name, tensor in torch.load(folder / f"run/weights/{stage}.pt", weights_only=True).items()
+    }
+
+
+UNINTERRUPTED: dict[str, torch.Tensor] = {}
+
+
 @pytest.mark.parametrize(
-    ("stage", "epoch"), [("pretrain", 3), ("pretrain", 22), ("finetune", 4)], ids=["layer1", "layer2", "finetune"]
+    ("stage", "epoch"), [("pretrain", 2), ("pretrain", 6), ("finetune", 2)], ids=["layer1", "layer2", "finetune"]
 )
-def test_killed_run_goes_on_bit_for_bit(
-    uninterrupted: Path, start_process: Start, tmp_path: Path, stage: str, epoch: int
-) -> None:
-    killed = start_process(*RUN, "hydra.run.dir=run")
-    wait_for_epoch(killed, tmp_path / "run/checkpoints" / stage / "last.ckpt", epoch)
-    killed.send_signal(signal.SIGKILL)
-    killed.communicate()
+def test_killed_run_goes_on_bit_for_bit(memcomp_train: Run, tmp_path: Path, stage: str, epoch: int) -> None:
+    if not UNINTERRUPTED:
+        (tmp_path / "whole").mkdir()
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(tmp_path / "whole")
+            outcome = memcomp_train(*RUN)
+        assert outcome.status == 0, outcome.err
+        UNINTERRUPTED.update(weights(tmp_path / "whole"))
+    process = killed(tmp_path, stage, epoch, "SIGKILL")
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    assert torch.load(tmp_path / f"run/checkpoints/{stage}/last.ckpt", weights_only=True)["epoch"] == epoch - 1
     assert not (tmp_path / "run/result.json").exists()
-    resumed = start_process("resume=run")
-    out, err = resumed.communicate()
-    assert resumed.returncode == 0, err
-    assert "test accuracy" in out
-    for name in ("pretrain", "finetune"):
-        expected = torch.load(uninterrupted / "weights" / f"{name}.pt", weights_only=True)
-        found = torch.load(tmp_path / "run/weights" / f"{name}.pt", weights_only=True)
-        assert all(expected[key].equal(found[key]) for key in expected)
+    outcome = memcomp_train("resume=run")
+    assert outcome.status == 0, outcome.err
+    assert "test accuracy" in outcome.out
+    found = weights(tmp_path)
+    assert found.keys() == UNINTERRUPTED.keys()
+    assert all(UNINTERRUPTED[key].equal(found[key]) for key in found)
 
 
-def test_interrupt_says_how_to_go_on(start_process: Start, tmp_path: Path) -> None:
-    process = start_process(*RUN, "hydra.run.dir=run", "finetune.iterations=10000")
-    wait_for_epoch(process, tmp_path / "run/checkpoints/finetune/last.ckpt", 1)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+def test_interrupt_says_how_to_go_on(tmp_path: Path) -> None:
+    process = killed(tmp_path, "finetune", 1, "SIGINT")
     assert process.returncode == 130
-    assert "Go on with: memcomp-train resume=run" in err
-    assert "Traceback" not in err
+    assert "Go on with: memcomp-train resume=run" in process.stderr
+    assert "Traceback" not in process.stderr
     assert not list(tmp_path.rglob("*.partial"))

@@ -18,8 +18,9 @@ from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm
 
 N_CHAINS = 60_013
-N_SWEEPS = 31
-LEVEL = 1e-3
+N_SWEEPS = 15
+LEVEL = 1e-7
+"""All tests of all samplers together reject a right one once in a million runs."""
 
 
 def changed(rbm, change):
@@ -31,7 +32,7 @@ def changed(rbm, change):
 
 def hotter(rbm):
     for parameter in rbm.parameters():
-        parameter *= 1.05
+        parameter *= 1.07
 
 
 def swap_visible_bias(rbm):
@@ -42,7 +43,7 @@ def swap_hidden_bias(rbm):
     rbm.c.copy_(rbm.c.flip(-1))
 
 
-MUTANTS = {"beta 1.05": hotter, "swapped b": swap_visible_bias, "swapped c": swap_hidden_bias}
+MUTANTS = {"beta 1.07": hotter, "swapped b": swap_visible_bias, "swapped c": swap_hidden_bias}
 
 
 def joint_probabilities(rbm, beta=1.0):
@@ -76,7 +77,7 @@ def draw_pcd(rbm, seed):
     sampler = PCD(k=3, n_chains=N_CHAINS)
     state = sampler.init(rbm, 2, generator=generator)
     positive = positive_phase(rbm, torch.zeros(2, rbm.n_visible))
-    for _ in range(11):
+    for _ in range(N_SWEEPS // 3):
         negative = sampler.sample(rbm, state, positive, generator=generator)
         state = negative.state
     return negative.configurations
@@ -97,14 +98,13 @@ def test_sample_count_suffices_for_the_mutant(rbm, mutation):
     shift = N_CHAINS * float(((wrong - right).square() / right).sum())
     df = len(right) - 1
     power = 1 - stats.ncx2.cdf(stats.chi2.ppf(1 - LEVEL, df), df, shift)
-    assert power > 0.99
+    assert power > 1 - 1e-6
 
 
 @each_model
 @each_sampler
 def test_chains_have_the_boltzmann_distribution(draw, rbm):
-    p_values = [chi_square_p_value(joint_counts(draw(rbm, s), s), joint_probabilities(rbm)) for s in range(3)]
-    assert min(p_values) > LEVEL
+    assert chi_square_p_value(joint_counts(draw(rbm, 0), 0), joint_probabilities(rbm)) > LEVEL
 
 
 @each_model
@@ -139,7 +139,7 @@ def test_tempered_sweeps_have_the_tempered_distribution(beta):
     for _ in range(N_SWEEPS):
         v = sweep(rbm, v, beta=beta, generator=generator)
     assert chi_square_p_value(state_counts(v), visible_probabilities(rbm, beta)) > LEVEL
-    for mutant in (beta + 0.05, 0.0 if beta else 0.1):
+    for mutant in (beta + 0.1, 0.0 if beta else 0.2):
         assert chi_square_p_value(state_counts(v), visible_probabilities(rbm, mutant)) < LEVEL
 
 

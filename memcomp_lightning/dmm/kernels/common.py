@@ -84,6 +84,6 @@ def keep_if_new(x, best):
 
 @njit(nogil=True, cache=True)
 def copy(source, target):
-    """Copy numbers one by one; an assignment of slices would take seconds to compile, for the words of its error."""
+    """Copy numbers one by one: an assignment of slices takes seconds to compile, for the words of its error."""
     for i in range(source.size):
         target[i] = source[i]
