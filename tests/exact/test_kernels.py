@@ -1,7 +1,10 @@
 """The compiled kernels against the readable one, step by step and after many steps."""
 
 import dataclasses
+import os
+import time
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -610,3 +613,20 @@ def test_hash_is_that_of_murmur3():
     for seed in (0, 7, 2**31, word):
         for counter in (0, 1, 12345, 2**31, 2**40 + 3):
             assert reference.uniform(torch.tensor(seed), torch.tensor(counter)).item() == hashed(seed, counter)
+
+
+# --- the cache --------------------------------------------------------------------------------------------
+
+
+def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_path):
+    """A file that is listed and no longer there, here a link to nothing, is no error; a new one stays."""
+    for name, age in (("old", 1e9), ("new", 0)):
+        path = tmp_path / f"lanes.{name}.nbi"
+        path.touch()
+        os.utime(path, (time.time() - age,) * 2)
+    (tmp_path / "lanes.gone.nbi").symlink_to("nowhere")
+    kernel = SimpleNamespace(
+        stats=SimpleNamespace(cache_path=str(tmp_path)), py_func=lanes.integrate_all.py_func, __name__="new"
+    )
+    cpu._announce.__wrapped__(kernel)
+    assert {path.name for path in tmp_path.iterdir()} == {"lanes.gone.nbi", "lanes.new.nbi"}

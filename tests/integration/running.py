@@ -11,6 +11,9 @@ from pathlib import Path
 THREADS = os.environ.get("MEMCOMP_THREADS", "1")
 """Of every process, as in this one: the last bits depend on their number."""
 
+HANGS_AFTER = 900
+"""Seconds after which a process is given up; far more than it takes on a busy machine."""
+
 QUIET = ["callbacks=minimal", "logger=none"]
 """Half of the time of a small run is that of its pictures."""
 

@@ -12,7 +12,7 @@ from typing import Any
 import hydra
 import pytest
 import torch
-from running import QUIET, Outcome
+from running import HANGS_AFTER, QUIET, Outcome
 from test_command_line import options
 
 from memcomp_lightning.cli import figures, report
@@ -368,7 +368,7 @@ def test_processes_end_with_the_one_that_started_them(start_process: Callable[..
         process = start_process(*forever)
         children = _wait_for(lambda process=process: _training_children(process.pid), 2)
         process.send_signal(stop)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=HANGS_AFTER)
         assert stop == signal.SIGKILL or "Go on with: memcomp-train resume=run" in err
         _wait_for(lambda children=children: [pid for pid in range(2) if not _alive(children[pid])], 2)
 
@@ -388,8 +388,8 @@ def _alive(pid: int) -> bool:
 
 
 def _wait_for(look: Callable[[], list[int]], n: int) -> list[int]:
-    for _ in range(240):
+    for _ in range(4 * HANGS_AFTER):
         if len(found := look()) >= n:
             return found
         time.sleep(0.25)
-    raise AssertionError(f"waited a minute, there are {found}")
+    raise AssertionError(f"there are {found}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from running import HANGS_AFTER, THREADS
 
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [
@@ -27,7 +28,7 @@ def test_two_processes_give_the_update_of_one(start_process: Start, tmp_path: Pa
     assert one.returncode == 0, err
     distributed = ["trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300"]
     two = start_process(*RUN, "hydra.run.dir=two", *distributed)
-    out, err = two.communicate(timeout=200)
+    out, err = two.communicate(timeout=HANGS_AFTER)
     assert two.returncode == 0, err
     for stage in ("pretrain", "finetune"):
         expected = torch.load(tmp_path / "one/weights" / f"{stage}.pt", weights_only=True)
@@ -103,8 +104,8 @@ if trainer.is_global_zero:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=200,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=HANGS_AFTER,
+        env={**os.environ, "OMP_NUM_THREADS": THREADS},
     )
     assert done.returncode == 0, done.stderr
     assert "calls of a shared sampler: [3, 0]" in done.stdout, "one answer an update serves both processes"

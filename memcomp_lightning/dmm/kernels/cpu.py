@@ -3,6 +3,7 @@
 import logging
 import os
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -361,7 +362,8 @@ def _announce(kernel: Any) -> None:
     # numba compiles anew when a function's own file changes, not when what it inlines does.
     inlined = Path(common.__file__).stat().st_mtime
     for index in folder.glob(f"{module}.*.nbi"):
-        if index.stat().st_mtime < inlined:
-            index.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # another process was first
+            if index.stat().st_mtime < inlined:
+                index.unlink()
     if not any(folder.glob(f"{module}.{kernel.__name__}*.nbi")):
         log.warning("Compiling the DMM kernel for this processor, once (about half a minute); kept in %s", folder)
