@@ -67,8 +67,9 @@ def test_moments_agree_with_parallel_chains_and_a_mutant_does_not():
     def largest_deviation(moment):
         return ((moment - measured).abs() / error).max()
 
-    assert largest_deviation(moments(exact(rbm))[0]) < 4.5
-    assert largest_deviation(moments_by_enumeration(rbm, beta=1.05)[0]) > 4.5
+    # 35 numbers: one in ten million is more than 6 standard errors off.
+    assert largest_deviation(moments(exact(rbm))[0]) < 6
+    assert largest_deviation(moments_by_enumeration(rbm, beta=1.1)[0]) > 6
 
 
 def test_error_names_size_of_the_smaller_layer_and_the_limit():
