@@ -48,6 +48,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 UNINTERRUPTED: dict[str, torch.Tensor] = {}
 
 
+@pytest.mark.filterwarnings("ignore:Checkpoint directory", "ignore:Be aware that when using `ckpt_path`")
 @pytest.mark.parametrize(
     ("stage", "epoch"), [("pretrain", 2), ("pretrain", 6), ("finetune", 2)], ids=["layer1", "layer2", "finetune"]
 )
