@@ -7,19 +7,18 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-_PLAIN = {"─": "-", "±": "+-", "·": "*", "×": "x"}
+_PLAIN = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{PLUS-MINUS SIGN}": "+-", "\N{MIDDLE DOT}": "*"}
 """Signs of our tables in an encoding that has none of them."""
 
 
 def say(text: str = "", *, error: bool = False) -> None:
     """Print a text at once, on standard error if ``error``."""
-    try:
+    # The reader has gone, the disk is full, the stream is closed, or cannot spell it.
+    with suppress(OSError, ValueError):
         print(text, file=sys.stderr if error else sys.stdout, flush=True)
-    except (OSError, ValueError):  # the reader has gone, the disk is full, the stream is closed or cannot spell it
-        pass
 
 
 @contextmanager
@@ -47,7 +46,7 @@ def make_tolerant() -> list[OSError]:
         stream = getattr(sys, name)
         if stream is None:
             _occupy(number)
-            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: PTH123, SIM115
+            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
         elif type(stream) is io.TextIOWrapper:  # no others, such as a notebook's
             setattr(sys, name, _tolerant(stream, failures if number == 1 else []))
             _hand_over(stream, getattr(sys, name))
@@ -99,10 +98,8 @@ def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWra
 
 
 def _flush(stream: io.TextIOWrapper) -> None:
-    try:
+    with suppress(OSError, ValueError):
         stream.flush()
-    except (OSError, ValueError):
-        pass
 
 
 def _hand_over(stream: io.TextIOWrapper, tolerant: io.TextIOWrapper) -> None:

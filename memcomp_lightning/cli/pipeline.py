@@ -15,6 +15,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
+from memcomp_lightning.cli.arguments import as_typed
 from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import instantiate
@@ -165,7 +166,7 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
             f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes, by a "
             "limit of the trainer or a callback: its weights are not recorded as trained. Give it fewer passes "
             f"({stage.module.stage}.iterations), or lift the limit and go on with "
-            f"resume={short_path(folder.path)}, from the last checkpoint "
+            f"{as_typed('memcomp-train', f'resume={short_path(folder.path)}')}, from the last checkpoint "
             f"(checkpoint_every={config.checkpoint_every})."
         )
     return trainer

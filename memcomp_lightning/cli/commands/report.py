@@ -9,8 +9,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from memcomp_lightning.cli.arguments import as_typed
 from memcomp_lightning.cli.errors import UserError, refuse
 from memcomp_lightning.cli.event_files import event_file
+from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.table import aligned, short_path
 from memcomp_lightning.cli.worth_report import write_worth
 from memcomp_lightning.errors import SettingError
@@ -39,7 +41,7 @@ def report(folder: Path) -> Section:
     except FileNotFoundError as error:
         raise UserError(str(error)) from error
     if not results.curves:
-        raise UserError(f"{folder} has no records yet: go on with memcomp-train resume={folder}")
+        raise UserError(f"{folder} has no records yet: go on with {as_typed('memcomp-train', f'resume={folder}')}")
     name = results.plan.name
     write_text(folder / f"{name}.csv", results.table())
     judged = verdicts(results)
@@ -59,7 +61,7 @@ def _report_worth(folder: Path) -> Section:
     """The same of a comparison of samplers."""
     worth = read_worth(folder)
     if not worth.data_sets:
-        raise UserError(f"{folder} has no courses yet: go on with memcomp-train resume={folder}")
+        raise UserError(f"{folder} has no courses yet: go on with {as_typed('memcomp-train', f'resume={folder}')}")
     figures, judged, notes = write_worth(worth, folder)
     pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
     return Section(worth.plan["title"], pictures, judged, [*_origin(folder), *notes], WORTH_RULE)
@@ -113,9 +115,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
         refuse(COMMAND, UserError(f"{error.filename} cannot be read or written ({error.strerror})."))
     for section in sections:
         if section.verdicts:
-            print(f"\n{section.title}\n{verdict_table(section.verdicts)}")
-    print(f"\nReport:  {short_path(output.absolute())}")
-
-
-if __name__ == "__main__":
-    main()
+            say(f"\n{section.title}\n{verdict_table(section.verdicts)}")
+    say(f"\nReport:  {short_path(output.absolute())}")

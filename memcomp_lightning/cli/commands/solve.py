@@ -14,15 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.cli.errors import INTERRUPTED, UserError, refuse
+from memcomp_lightning.cli.arguments import read
+from memcomp_lightning.cli.errors import UserError, refuse
 from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
-from memcomp_lightning.cli.overrides import (
-    CONFIG_MODULE,
-    check_command_line,
-    check_finite,
-    check_seed,
-    is_multirun,
-)
+from memcomp_lightning.cli.output import make_tolerant, say
+from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, check_finite, check_seed
 from memcomp_lightning.cli.table import short_path
 from memcomp_lightning.dmm import DmmSolver, default_steps
 from memcomp_lightning.errors import SettingError, require, require_choice
@@ -59,13 +55,14 @@ _LONGEST_PRINTED = 100
 @hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="solve", **MAIN)
 def solve(config: DictConfig) -> None:
     """One problem, or one job of a sweep."""
+    settings = HydraConfig.get()
+    make_tolerant()  # again: a job of a parallel launcher is in a process of its own
+    os.chdir(settings.runtime.cwd)  # paths are meant from there, with hydra.job.chdir=true, too
     try:
         problem, solver = prepare(config)
-        print("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]), flush=True)
+        say("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]))
         solution = _minimise(problem, solver, config.seed)
-        print(f"\n{_table(problem, problem.answer(solution), solution.wall_time_s)}\n", flush=True)
-        folder = Path(HydraConfig.get().runtime.output_dir)
-        _write(folder, config, problem, solution)
+        _write(Path(settings.runtime.output_dir), config, problem, solution)
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
 
@@ -217,23 +214,30 @@ def _bits(x: Tensor) -> str:
 
 
 def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> None:
-    """Solution and picture, and say where they are."""
+    """Solution and picture; then the table, and where they are. What cannot be written is printed all the more."""
     solver = OmegaConf.to_container(config.solver, resolve=True)
     assert isinstance(solver, dict)
     settings: dict[str, Any] = {str(name): value for name, value in solver.items()}
-    file = folder / "solution.json"
+    file, written, picture, lost = folder / "solution.json", False, None, ""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_solution(file, problem, solution, solver=settings, seed=config.seed)
-        holds = "" if problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
-        print(f"Solution:    {short_path(file)}{holds}", flush=True)
+        written = True
         if solution.trajectory is not None:
             picture = _draw(folder, problem.name, solution.trajectory)
-            print(f"Trajectory:  {short_path(picture)}, .svg", flush=True)
     except OSError as error:
-        raise UserError(
-            f"folder {folder} cannot be written ({error.strerror}): choose another with hydra.run.dir=PATH"
-        ) from error
+        lost = f"folder {folder} cannot be written ({error.strerror}): choose another with hydra.run.dir=PATH"
+    answer = problem.answer(solution)
+    say(f"\n{_table(problem, answer, solution.wall_time_s)}\n")
+    holds = "" if problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
+    if written:
+        say(f"Solution:    {short_path(file)}{holds}")
+    elif holds:
+        say(f"Assignment:  {_bits(answer.assignment)}")
+    if picture is not None:
+        say(f"Trajectory:  {short_path(picture)}, .svg")
+    if lost:
+        raise UserError(lost)
 
 
 def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:
@@ -246,42 +250,20 @@ def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:
     return picture
 
 
-def _as_hydra_reads(argument: str, *, multirun: bool) -> str:
-    """``problem=FILE`` in quotes, so that a file may have commas, brackets and = in its name.
-
-    In a sweep the commas are between files, unless there is a file of the whole name.
-    """
-    name, equals, value = argument.partition("=")
-    if name == "problem" and value[:1] not in ("", "'", '"') and (not multirun or _is_file(value)):
-        quoted = value.replace("'", r"\'")
-        return f"problem='{quoted}'"
-    if not equals and _is_file(argument):
-        raise UserError(f"{argument} is no setting: expected NAME=VALUE. Did you mean problem={argument}?")
-    return argument
-
-
-def _is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except OSError:  # the name is too long
-        return False
-
-
 def main() -> None:
-    """Entry point: check everything, solve, and end with a table or a message."""
+    """Check everything, solve, and end with a table or a message."""
     try:
-        multirun = is_multirun(sys.argv)
-        sys.argv[1:] = [_as_hydra_reads(argument, multirun=multirun) for argument in sys.argv[1:]]
-        check_command_line(
-            sys.argv[1:], config_name="solve", check=lambda config, _: prepare(config), folders=("solve", "solve")
+        line = check_command_line(
+            read(sys.argv[1:]),
+            config_name="solve",
+            check=lambda config, _: prepare(config),
+            folders=("solve", "solve"),
         )
-        solve()
+        sys.argv[1:] = line.arguments
+        with answering(line):
+            solve()
     except UserError as error:
         refuse(COMMAND, error)
-    except KeyboardInterrupt:
-        print(f"\n{COMMAND}: interrupted, no solution is written.", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-
-
-if __name__ == "__main__":
-    main()
+    except KeyboardInterrupt as interrupt:
+        rest = "Finished jobs keep their solutions." if "--multirun" in sys.argv else "No solution is written."
+        raise KeyboardInterrupt(rest) from interrupt

@@ -17,12 +17,14 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli import figures, pipeline, sweep, trajectory, worth
-from memcomp_lightning.cli.commands import report
+from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
-from memcomp_lightning.cli.errors import INTERRUPTED, UserError, explain, refuse
+from memcomp_lightning.cli.commands import report
+from memcomp_lightning.cli.errors import UserError, explain, refuse
 from memcomp_lightning.cli.hydra_versions import MAIN
-from memcomp_lightning.cli.overrides import CONFIG_MODULE, check_command_line, is_multirun, search_path
+from memcomp_lightning.cli.output import make_tolerant, say
+from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, search_path
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
@@ -42,8 +44,8 @@ def train(config: DictConfig) -> float | None:
         What a search goes by: accuracy on held-out training images after the last pass, mean over replicas; 0 of a
         job that diverged. None where no images are held out, or a job failed.
     """
-    _silence_lightning()  # again: a job of a parallel launcher is in a process of its own
     settings = HydraConfig.get()
+    _begin_job(settings.runtime.cwd)
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
@@ -102,11 +104,11 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
             config, choice = settle(config, folder)
             result = pipeline.run(build(config), config, folder, _by_name(overrides), choice)
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
-            raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
+            raise KeyboardInterrupt(_go_on(folder)) from stop
     else:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
-        print(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}", flush=True)
+        say(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}")
     held_out = result.get("validation_accuracy")
     return sum(held_out) / len(held_out) if held_out else None
 
@@ -128,8 +130,12 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
                 train(part, own, trained[-1])
         report.main([*map(str, trained), "--output", str(folder.report)])
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(f"Go on with: memcomp-train resume={short_path(folder.path)}") from stop
+        raise KeyboardInterrupt(_go_on(folder)) from stop
     folder.forget_error()
+
+
+def _go_on(folder: RunFolder) -> str:
+    return f"Go on with: {as_typed(COMMAND, f'resume={short_path(folder.path)}')}"
 
 
 def _is_first_process() -> bool:
@@ -147,57 +153,76 @@ def _resumed(arguments: list[str]) -> list[str]:
     folders = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
     if not folders:
         return arguments
-    folder = Path(folders[-1].strip("'\""))
-    overrides = RunFolder(folder).overrides
+    name = unquoted(folders[-1])
+    if not name:
+        raise UserError("resume= names no folder: write resume=FOLDER, the folder of a run of memcomp-train.")
+    folder = RunFolder(Path(expanded("resume", name)))
+    overrides = folder.overrides
     if overrides is None:
         raise UserError(
-            f"resume={folder}: there is no overrides.json. Name the folder of a run of memcomp-train; a sweep "
-            "goes on when the same command is given with hydra.sweep.dir=FOLDER."
+            f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
+            "sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
         )
-    quoted = str(folder).replace("'", r"\'")
-    return [*overrides, *(a for a in arguments if not a.startswith("resume=")), f"hydra.run.dir='{quoted}'"]
+    others = [argument for argument in arguments if not argument.startswith("resume=")]
+    return [
+        *(from_folder(o, folder.typed_in) for o in overrides),
+        *others,
+        with_path("hydra.run.dir", folder.path),
+    ]
 
 
 def main() -> None:
-    """Entry point: check everything, train, and end with a table or a message."""
+    """Check everything, train, and end with a table or a message."""
     _silence_lightning()
     try:
-        sys.argv[1:] = _resumed(sys.argv[1:])
-        if is_multirun(sys.argv) and any(
-            a.startswith("trainer.devices=") and a != "trainer.devices=1" for a in sys.argv
-        ):
-            raise UserError(
-                "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
-                "processes. Give the jobs one by one, or use one device with a parallel launcher."
-            )
         if "LOCAL_RANK" not in os.environ:
-            check_command_line(
-                sys.argv[1:],
+            line = check_command_line(
+                _read(sys.argv[1:]),
                 config_name="config",
                 check=_check,
                 folders=("runs", "multirun"),
                 check_searchable=check_searchable,
             )
-        train()
+            sys.argv[1:] = line.arguments
+            with answering(line):
+                train()
+        else:
+            train()
     except UserError as error:
         refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
-        how = str(interrupt)
         if sweep.RememberSweepFolder.folder is not None:
-            how = f"Go on with the same command and hydra.sweep.dir={short_path(sweep.RememberSweepFolder.folder)}"
-        print(f"\n{COMMAND}: interrupted. {how}".rstrip(), file=sys.stderr)
-        sys.exit(INTERRUPTED)
+            raise KeyboardInterrupt(f"Go on with: {as_typed(COMMAND, *sys.argv[1:])}") from interrupt
+        raise
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
-        print(f"\n{table}\n{closing_lines(short_path(folder))}", flush=True)
+        say(f"\n{table}\n{closing_lines(short_path(folder))}")
         sys.exit(1 if n_failed else 0)
+
+
+def _read(arguments: list[str]) -> CommandLine:
+    line = read(_resumed(arguments))
+    devices = line.value("trainer.devices")
+    if line.multirun and devices not in (None, "1"):
+        raise UserError(
+            "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
+            "processes. Give the jobs one by one, or use one device with a parallel launcher."
+        )
+    return line
+
+
+def _begin_job(folder: str) -> None:
+    """What a job needs in a process of its own, which a parallel launcher starts, and in the first one.
+
+    Args:
+        folder: Where the command was typed: paths are meant from there, with ``hydra.job.chdir=true``, too.
+    """
+    make_tolerant()
+    _silence_lightning()
+    os.chdir(folder)
 
 
 def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
-
-
-if __name__ == "__main__":
-    main()
