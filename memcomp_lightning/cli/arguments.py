@@ -13,7 +13,9 @@ from typing import Any, NoReturn
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
+from hydra.plugins.completion_plugin import CompletionPlugin
 
 from memcomp_lightning.cli.errors import UserError
 
@@ -112,7 +114,9 @@ def read(arguments: Sequence[str]) -> CommandLine:
     shows += [value for value in (given.cfg, given.info) if value is not None]
     shows += ["--resolve"] if given.resolve else []
     overrides = given.overrides
-    if not given.shell_completion:  # whose arguments are no settings
+    if given.shell_completion:
+        _check_completion(overrides)
+    else:
         _check_blanks(overrides)
         overrides = [_readable(override, multirun=multirun) for override in overrides]
     folder = None if given.config_dir is None else Path(expanded("--config-dir", given.config_dir)).absolute()
@@ -183,7 +187,7 @@ def _readable(override: str, *, multirun: bool) -> str:
         swept = multirun and name not in _NEVER_SWEPT and not _is_file(text)
         return _path(name, text, swept=swept)
     text = text.strip()
-    readable = f"{name}={'null' if text == 'None' and '.' in name else text}"
+    readable = f"{name}={'null' if text == 'None' else text}"
     if parse(readable).is_sweep_override() and not multirun:
         raise UserError(
             f"{override} has several values, which are jobs of a sweep: add -m.{_one_value(name, text)}"
@@ -195,13 +199,14 @@ def _one_value(name: str, text: str) -> str:
     """How one value is written that looks like several."""
     if re.fullmatch(r"[-+]?\d+,\d+", text):
         return f" A decimal number has a point: {name}={text.replace(',', '.')}."
-    if "(" in text:
+    if "(" in text or "." not in name:
         return ""
     return f" One list is {name}=[{text}]; a text with commas stands in quotes: {_for_shell(name, text)}."
 
 
 def _path(name: str, text: str, *, swept: bool) -> str:
     """A path, in quotes where Hydra needs them, so that a file is called as it likes."""
+    text = "null" if text.strip() == "None" and not _is_file(text) else text
     value = _value(text)
     if value is None or (isinstance(value, bool | list | dict) and not _is_file(text)):
         return f"{name}={text}"
@@ -211,7 +216,7 @@ def _path(name: str, text: str, *, swept: bool) -> str:
         files = _files(value)
         if not files:
             raise UserError(f"{name}={text} matches no file in {Path.cwd()}.")
-        if not swept:
+        if len(files) > 1 and not swept:
             raise UserError(f"{name}={text} stands for {len(files)} files, the jobs of a sweep: add -m.")
         return f"{name}={','.join(with_path('', file)[1:] for file in files)}"
     if swept and ("," in text or "(" in text):
@@ -335,6 +340,14 @@ def _check_blanks(overrides: Sequence[str]) -> None:
             parts.append(after)
         if argument == "=" or (len(parts) > 1 and all(parts)):
             raise UserError(f"{' '.join(parts)} has blanks around the =: write {''.join(parts)}")
+
+
+def _check_completion(arguments: Sequence[str]) -> None:
+    """Refuse what --shell-completion does not take."""
+    shells = sorted(plugin.provides() for plugin in Plugins.instance().discover(CompletionPlugin))
+    allowed = [f"{what}={shell}" for what in ("install", "uninstall", "query") for shell in shells]
+    if len(arguments) != 1 or arguments[0] not in allowed:
+        raise UserError(f"--shell-completion {' '.join(arguments)}: expected one of {', '.join(allowed)}.")
 
 
 def _refuse_flag(message: str) -> NoReturn:

@@ -1,6 +1,7 @@
 """How every command starts and ends. Light: what is heavy is imported where Ctrl-C is already answered."""
 
 import errno
+import logging
 import os
 import signal
 import sys
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from memcomp_lightning import __version__
+from memcomp_lightning import __version__, compiling
 from memcomp_lightning.cli.output import say, tolerant_streams
 
 INTERRUPTED = 130
@@ -31,7 +32,7 @@ def run(command: str, *arguments: Any) -> None:
         with tolerant_streams() as failures:
             say(f"{command} {__version__}")
         sys.exit(LOST_OUTPUT if failures else 0)
-    with tolerant_streams() as failures:
+    with tolerant_streams() as failures, _told_of_compilation(command):
         try:
             with _ended_at_once(command):
                 name = command.removeprefix("memcomp-")
@@ -66,3 +67,20 @@ def _ended_at_once(command: str) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _told_of_compilation(command: str) -> Iterator[None]:
+    """Print what ``compiling`` logs, before Hydra has set up logging as well as after it, as one plain line."""
+    log, handler = logging.getLogger(compiling.__name__), logging.Handler()
+    handler.emit = lambda record: say(f"{command}: {record.getMessage()}", error=True)  # type: ignore[method-assign]
+    before = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before[0])
+        log.propagate = before[1]

@@ -57,12 +57,12 @@ class _Tolerant(io.RawIOBase):
     """A raw stream that reports everything as written, and keeps the first reason why something was not."""
 
     def __init__(self, raw: Any, name: str, failures: list[OSError]) -> None:
-        self.raw, self.name, self.failures = raw, name, failures
+        self._raw, self.name, self.failures = raw, name, failures
 
     def write(self, data: Any) -> int:
         size = memoryview(data).nbytes
         try:
-            written: int | None = self.raw.write(data)
+            written: int | None = self._raw.write(data)
         except (OSError, ValueError) as error:
             if not self.failures:
                 self.failures.append(error if isinstance(error, OSError) else OSError(errno.EBADF, str(error)))
@@ -73,10 +73,10 @@ class _Tolerant(io.RawIOBase):
         return True
 
     def fileno(self) -> int:
-        return int(self.raw.fileno())
+        return int(self._raw.fileno())
 
     def isatty(self) -> bool:
-        return bool(self.raw.isatty())
+        return bool(self._raw.isatty())
 
 
 def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWrapper:

@@ -19,7 +19,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.arguments import CommandLine, parse
+from memcomp_lightning.cli.arguments import CommandLine, is_path, parse
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
 from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
@@ -190,7 +190,11 @@ def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[s
         if override.is_delete() and name in plain:
             instead = f"Choose another option with {name}=NAME. {known}" if known else f"Give it: {name}=VALUE."
             raise UserError(f"{typed} is not possible: {name} is needed. {instead}")
-        if name in groups and name in plain.hydra.runtime.choices and override.is_add():
+        if (
+            name in groups
+            and name in plain.hydra.runtime.choices
+            and (override.is_add() or override.is_force_add())
+        ):
             raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
         if name in groups and not override.is_delete() and not override.is_sweep_override():
             value = override.value()
@@ -227,11 +231,19 @@ def _of_another_kind(config_name: str, job: Sequence[str], paths: Sequence[str])
 
 def _naming_override(message: str, job: Sequence[str]) -> str:
     """A message that names the override it is about, where a library repeats the value alone."""
-    pairs = [(o, *o.lstrip("+~").partition("=")[::2]) for o in job]
-    if any(name in message for _, name, _ in pairs):
+    given = {o: o.lstrip("+~").partition("=")[::2] for o in job}
+    if any(name in message or name.rpartition(".")[0] + ":" in message for name, _ in given.values()):
         return message
-    meant = [o for o, _, value in pairs if value and re.search(rf"(?<!\w){re.escape(value)}(?!\w)", message)]
-    return f"{meant[0]}: {message}" if len(meant) == 1 else message
+    meant = {
+        override: value
+        for override, (name, value) in given.items()
+        if value and not is_path(name) and re.search(rf"(?<!\w){re.escape(value)}(?!\w)", message)
+    }
+    if len(meant) != 1:
+        return message
+    ((override, value),) = meant.items()
+    remedy = " Write true or false." if value.lower() in ("yes", "no", "on", "off") else ""
+    return f"{override}: {message}{remedy}"
 
 
 def _check_groups(folder: Path) -> None:
