@@ -1,18 +1,12 @@
-"""How every command starts and ends. Light: what is heavy is imported where Ctrl-C is already answered."""
+"""How every command starts and ends.
+
+What takes time is imported inside, after ``run`` has seen to it that Ctrl-C ends the command by one line.
+"""
 
 import errno
-import logging
 import os
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib import import_module
-from typing import Any
-
-from memcomp_lightning import __version__, compiling
-from memcomp_lightning.cli.output import say, tolerant_streams
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -21,22 +15,34 @@ LOST_OUTPUT = 1
 """Exit status where the output was all that was asked for, and could not be written."""
 
 
-def run(command: str, *arguments: Any) -> None:
+def run(command: str, *arguments: object) -> None:
     """Run ``memcomp-NAME``: the ``main`` of ``memcomp_lightning.cli.commands.NAME``.
 
     Args:
         command: Its name.
         arguments: Of its main.
     """
+    before = _end_at_once_on_interrupt(command)
+    try:
+        _run(command, arguments, before)
+    finally:
+        _answer_interrupts(before)
+
+
+def _run(command: str, arguments: tuple[object, ...], on_interrupt: object) -> None:
+    from importlib import import_module
+
+    from memcomp_lightning import __version__
+    from memcomp_lightning.cli.output import compilation_told, say, tolerant_streams
+
     if {"--version", "-V"} & set(sys.argv[1:]):
         with tolerant_streams() as failures:
             say(f"{command} {__version__}")
         sys.exit(LOST_OUTPUT if failures else 0)
-    with tolerant_streams() as failures, _told_of_compilation(command):
+    with tolerant_streams() as failures, compilation_told(command):
         try:
-            with _ended_at_once(command):
-                name = command.removeprefix("memcomp-")
-                main = import_module(f"memcomp_lightning.cli.commands.{name}").main
+            main = import_module(f"memcomp_lightning.cli.commands.{command.removeprefix('memcomp-')}").main
+            _answer_interrupts(on_interrupt)
             main(*arguments)
         except KeyboardInterrupt as interrupt:
             say(f"\n{command}: interrupted. {interrupt}".rstrip(), error=True)
@@ -47,40 +53,27 @@ def run(command: str, *arguments: Any) -> None:
                 say(f"{command}: not all of the output could be written ({failures[0].strerror}).", error=True)
 
 
-@contextmanager
-def _ended_at_once(command: str) -> Iterator[None]:
-    """Let Ctrl-C end the process within this block, in which nothing is written.
+def _end_at_once_on_interrupt(command: str) -> object:
+    """Let Ctrl-C end the process while modules are imported, and nothing is written; return what it did before.
 
     Libraries that are being imported would swallow the exception, or turn it into others.
     """
 
     def end(*_: object) -> None:
-        say(f"\n{command}: interrupted, nothing was written.", error=True)
-        os._exit(INTERRUPTED)
+        line = f"\n{command}: interrupted, nothing was written.\n".encode()
+        try:
+            os.write(2, line)
+        finally:
+            os._exit(INTERRUPTED)
 
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    if before is signal.default_int_handler:  # a shell lets processes in the background ignore it
+        _answer_interrupts(end)
+    return before
 
 
-@contextmanager
-def _told_of_compilation(command: str) -> Iterator[None]:
-    """Print what ``compiling`` logs, before Hydra has set up logging as well as after it, as one plain line."""
-    log, handler = logging.getLogger(compiling.__name__), logging.Handler()
-    handler.emit = lambda record: say(f"{command}: {record.getMessage()}", error=True)  # type: ignore[method-assign]
-    before = log.level, log.propagate
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    log.propagate = False
-    try:
-        yield
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(before[0])
-        log.propagate = before[1]
+def _answer_interrupts(handler: object) -> None:
+    try:  # noqa: SIM105 (contextlib would be one import more before Ctrl-C is answered)
+        signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
+    except (TypeError, ValueError):  # a handler that is not Python's; not the main thread
+        pass

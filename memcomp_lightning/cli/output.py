@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from memcomp_lightning import compiling
+
 _PLAIN = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{PLUS-MINUS SIGN}": "+-", "\N{MIDDLE DOT}": "*"}
 """Signs of our tables in an encoding that has none of them."""
 
@@ -125,3 +127,20 @@ def _spelt_out(error: UnicodeError) -> tuple[str, int]:
     assert isinstance(error, UnicodeEncodeError)
     signs = error.object[error.start : error.end]
     return "".join(_PLAIN.get(s, s.encode("ascii", "backslashreplace").decode()) for s in signs), error.end
+
+
+@contextmanager
+def compilation_told(command: str) -> Iterator[None]:
+    """Print what ``compiling`` logs, before Hydra has set up logging as well as after it, as one plain line."""
+    log, handler = logging.getLogger(compiling.__name__), logging.Handler()
+    handler.emit = lambda record: say(f"{command}: {record.getMessage()}", error=True)  # type: ignore[method-assign]
+    before = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before[0])
+        log.propagate = before[1]
