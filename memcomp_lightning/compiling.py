@@ -17,7 +17,7 @@ def announce_compilation() -> None:
     """
     from numba.core import event
 
-    class Announcement(event.Listener):  # type: ignore[misc]
+    class Announcement(event.Listener):
         def on_start(self, event: Any) -> None:
             package, _, name = str(event.data["dispatcher"].py_func.__module__).partition(".")
             if package == __package__:
@@ -26,7 +26,7 @@ def announce_compilation() -> None:
         def on_end(self, event: Any) -> None:
             pass
 
-    event.register("numba:compile", Announcement())
+    event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
 
 
 @cache

@@ -344,7 +344,8 @@ def _check_blanks(overrides: Sequence[str]) -> None:
 
 def _check_completion(arguments: Sequence[str]) -> None:
     """Refuse what --shell-completion does not take."""
-    shells = sorted(plugin.provides() for plugin in Plugins.instance().discover(CompletionPlugin))
+    plugins: Any = Plugins.instance().discover(CompletionPlugin)
+    shells = sorted(plugin.provides() for plugin in plugins)
     allowed = [f"{what}={shell}" for what in ("install", "uninstall", "query") for shell in shells]
     if len(arguments) != 1 or arguments[0] not in allowed:
         raise UserError(f"--shell-completion {' '.join(arguments)}: expected one of {', '.join(allowed)}.")
