@@ -57,6 +57,7 @@ class CommandLine:
         shows: The flag that shows something in place of a run, with its value; none in a run.
         config_dir: A folder of configurations, absolute.
         package: The part of the configuration that is shown, None for all of it.
+        claimed: The folder that was made for this command, None before that or where the arguments name one.
     """
 
     overrides: tuple[str, ...]
@@ -64,6 +65,7 @@ class CommandLine:
     shows: tuple[str, ...]
     config_dir: Path | None
     package: str | None
+    claimed: Path | None = None
 
     @property
     def arguments(self) -> list[str]:
@@ -77,9 +79,9 @@ class CommandLine:
         texts = [text for key, _, text in (o.partition("=") for o in self.overrides) if key == name]
         return unquoted(texts[-1]) if texts else None
 
-    def giving(self, name: str, path: Path) -> "CommandLine":
-        """The same with one path more."""
-        return replace(self, overrides=(*self.overrides, with_path(name, path)))
+    def writing_to(self, folder: Path, name: str) -> "CommandLine":
+        """The same with a folder of its own as the setting of this name."""
+        return replace(self, overrides=(*self.overrides, with_path(name, folder)), claimed=folder)
 
 
 def read(arguments: Sequence[str]) -> CommandLine:
@@ -197,7 +199,7 @@ def _readable(override: str, *, multirun: bool) -> str:
 
 def _one_value(name: str, text: str) -> str:
     """How one value is written that looks like several."""
-    if re.fullmatch(r"[-+]?\d+,\d+", text):
+    if re.fullmatch(r"[-+]?\d+,\d+", text) and "." in name:
         return f" A decimal number has a point: {name}={text.replace(',', '.')}."
     if "(" in text or "." not in name:
         return ""

@@ -120,7 +120,7 @@ def check_command_line(
                 raise UserError((message or _naming_override(explain(error), job)) + where) from error
     if line.shows or line.value(key) is not None or folder is None:
         return line
-    return line.giving(key, claimed(Path(folder)))
+    return line.writing_to(claimed(Path(folder)), key)
 
 
 @contextmanager
@@ -139,10 +139,9 @@ def answering(line: CommandLine) -> Iterator[None]:
             raise
         raise UserError(" ".join(str(error).split())) from error
     finally:
-        folder = line.value("hydra.sweep.dir" if line.multirun else "hydra.run.dir")
-        if folder is not None and not line.shows:
-            with suppress(OSError):
-                Path(folder).rmdir()
+        if line.claimed is not None:
+            with suppress(OSError):  # it is in use
+                line.claimed.rmdir()
 
 
 def claimed(folder: Path) -> Path:

@@ -104,6 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="folder of a run of a figure")
     parser.add_argument("--output", type=Path, help="the page; default: report.html in the first folder")
+    parser.error = lambda message: refuse(COMMAND, UserError(f"{message}. {COMMAND} --help shows how."))  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
     try:
         sections = [report(folder) for folder in given.folders]
