@@ -43,7 +43,7 @@ with tolerant_streams() as failures:
     for _ in tqdm(range(3)):
         say("a table: \\N{PLUS-MINUS SIGN} \\N{BOX DRAWINGS LIGHT HORIZONTAL} \\N{GREEK SMALL LETTER PHI}")
         logging.info("a line of a log")
-        print("a line of a library " * 1000)
+        print("a line of a library " * 20000)  # more than a pipe holds
     say("an error", error=True)
     print("no flush", end="")
 Path("done").write_text(str([failure.errno for failure in failures]))
