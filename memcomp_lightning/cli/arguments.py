@@ -208,6 +208,8 @@ def _one_value(name: str, text: str) -> str:
 
 def _path(name: str, text: str, *, swept: bool) -> str:
     """A path, in quotes where Hydra needs them, so that a file is called as it likes."""
+    if not text.strip(" '\"") and name != "problem":
+        raise UserError(f"{name}={text} names no path: write {name}=PATH")
     text = "null" if text.strip() == "None" and not _is_file(text) else text
     value = _value(text)
     if value is None or (isinstance(value, bool | list | dict) and not _is_file(text)):

@@ -70,6 +70,8 @@ REFUSED = {
     "--package=model": ["--package model", "add --cfg job"],
     "--resolve": ["--resolve", "add --cfg job"],
     "--shell-completion": ["install=bash"],
+    "hydra.run.dir=": ["hydra.run.dir= names no path"],
+    "model.weights=''": ["model.weights='' names no path"],
     "problem=~no such user/g.txt": ["problem=~no such user/g.txt", "problem=./~no such user/g.txt"],
     "model.weights=~no such user/w.pt": ["model.weights=~no such user/w.pt"],
     "hydra.run.dir=~no such user/runs": ["hydra.run.dir=~no such user/runs"],
@@ -193,6 +195,7 @@ FLAGS = {
     "--cfg job --package nothing": "--package nothing",
     "--config-dir nowhere --help": "there is no such folder",
     "hydra.mode=MULTIRUN seed=0,x": "seed = 'x'",
+    "-m resume=run": "resume=run goes on with one run, without -m",
     "-m sampler=glob(zz*)": "sampler=glob(zz*) matches nothing",
     "-m seed=glob(zz*)": "seed is none",
     "-m seed=range(0)": "seed=range(0) matches nothing",
@@ -279,7 +282,7 @@ def test_values_of_another_kind(memcomp_train: Run, argument: str) -> None:
 
 
 def test_spellings_of_values(memcomp_train: Run) -> None:
-    spelt = ["trainer.enable_progress_bar=FALSE", "finetune.batch_size=None", "pretrain.optimizer.lr=1e-2"]
+    spelt = ["trainer.fast_dev_run=FALSE", "finetune.batch_size=None", "pretrain.optimizer.lr=1e-2"]
     outcome = memcomp_train(*SHORT, *spelt, "seed = 3", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
 

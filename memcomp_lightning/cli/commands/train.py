@@ -156,6 +156,11 @@ def _resumed(arguments: list[str]) -> list[str]:
     name = unquoted(folders[-1])
     if not name:
         raise UserError("resume= names no folder: write resume=FOLDER, the folder of a run of memcomp-train.")
+    if {"-m", "--multirun"} & set(arguments):
+        raise UserError(
+            f"resume={name} goes on with one run, without -m; a sweep goes on when the same command is given with "
+            "hydra.sweep.dir=FOLDER."
+        )
     folder = RunFolder(Path(expanded("resume", name)))
     overrides = folder.overrides
     if overrides is None:
