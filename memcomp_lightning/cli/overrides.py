@@ -230,6 +230,8 @@ def _of_another_kind(config_name: str, job: Sequence[str], paths: Sequence[str])
 
 def _naming_override(message: str, job: Sequence[str]) -> str:
     """A message that names the override it is about, where a library repeats the value alone."""
+    if " is not allowed: expected " in message:  # our own
+        return message
     given = {o: o.lstrip("+~").partition("=")[::2] for o in job}
     if any(name in message or f"{name.rpartition('.')[0] or name}:" in message for name, _ in given.values()):
         return message
