@@ -276,7 +276,7 @@ def shell(tmp_path: Path) -> Shell:
     return Shell(tmp_path)
 
 
-AWKWARD = 'my runs/it\'s $HOME, "so"'
+AWKWARD = 'my runs/it\'s $no, "so"'  # Lightning's TensorBoardLogger puts in variables that exist
 
 
 def interrupting(monkeypatch: pytest.MonkeyPatch) -> None:
