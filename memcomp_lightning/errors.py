@@ -31,7 +31,8 @@ def require(condition: bool, name: str, value: object, allowed: str, remedy: str
 def require_count(name: str, value: object, minimum: int = 1) -> None:
     """Raise unless ``value`` is an integer of at least ``minimum``."""
     valid = isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= minimum
-    require(valid, name, value, f"an integer >= {minimum}")
+    whole = isinstance(value, float) and value.is_integer()
+    require(valid, name, value, f"an integer >= {minimum}", f"Write {value:.0f}." if whole else "")
 
 
 def require_choice(name: str, value: object, allowed: Collection[str]) -> None:

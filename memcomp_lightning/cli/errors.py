@@ -8,8 +8,10 @@ from typing import NoReturn
 
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
+
+from memcomp_lightning.cli.output import say
 
 
 class UserError(Exception):
@@ -31,13 +33,10 @@ CONFIGURATION_ERRORS = (
 USAGE_ERROR = 2
 """Exit status when a setting is refused."""
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
-
 
 def refuse(command: str, error: Exception) -> NoReturn:
     """End with the message alone."""
-    print(f"{command}: {error}", file=sys.stderr)
+    say(f"{command}: {error}", error=True)
     sys.exit(USAGE_ERROR)
 
 
@@ -52,7 +51,7 @@ def explain(error: BaseException) -> str:
         return f"{setting}: {text}" if setting else text
     if isinstance(error, MissingConfigException) and error.options and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.rpartition("/")
-        close = difflib.get_close_matches(option, error.options, n=1)
+        close = _nearest(option, error.options)
         hint = f" Did you mean {group}={close[0]}?" if close else ""
         plugin = group in ("hydra/launcher", "hydra/sweeper")
         remedy = " Plugins of Hydra: pip install 'memcomp-lightning[sweep]'." if plugin else ""
@@ -63,6 +62,10 @@ def explain(error: BaseException) -> str:
         return " ".join([*text.split(), reason]).rstrip()
     if isinstance(error, YAMLError):
         return f"a configuration file is no YAML: {' '.join(str(error).split())}"
+    if isinstance(error, ConfigKeyError | ConfigAttributeError) and error.full_key:
+        return f"setting {error.full_key} is missing: it was taken away, or a configuration file leaves it out."
+    if isinstance(error, OmegaConfBaseException):
+        return " ".join(str(error).split())
     setting = _full_key(*getattr(error, "__notes__", ()))  # Hydra 1.4 does not wrap what a target raises
     text = in_words(error)
     return f"{setting}: {text}" if setting else text
@@ -102,9 +105,15 @@ def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str]
         known = sorted(f"{parent}.{key!s}".lstrip(".") for key in node)
     else:
         known = sorted(str(key) for key in defaults)
-    close = difflib.get_close_matches(name, known, n=1)
+    close = _nearest(name, known)
     hint = f" Did you mean {close[0]}?" if close else ""
     return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
+
+
+def _nearest(name: str, known: Collection[str]) -> list[str]:
+    """The known name that is likest, whatever the case of its letters."""
+    folded = {other.lower(): other for other in known}
+    return [folded[other] for other in difflib.get_close_matches(name.lower(), folded, n=1)]
 
 
 def _full_key(*lines: str) -> str:

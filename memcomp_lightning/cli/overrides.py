@@ -1,26 +1,31 @@
 """The command line before Hydra sees it: every job is composed and checked, and nothing is written."""
 
 import hashlib
+import itertools
 import math
+import re
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.conf import HydraConf
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from hydra.errors import HydraException
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
+from memcomp_lightning.cli.arguments import CommandLine, is_path, parse
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, UserError, explain, unknown_setting
 from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
-from memcomp_lightning.cli.search import planned_jobs
+from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.errors import require, require_choice
 
 CONFIG_MODULE = "memcomp_lightning.conf"
-
-MULTIRUN_FLAGS = {"-m", "--multirun"}
 
 _SEARCH_PATH = "hydra.searchpath="
 _SEARCHES = ("hparams=", "hydra/sweeper=")
@@ -44,45 +49,52 @@ def job_folder(overrides: str) -> str:
 register_resolver("memcomp_job_folder", job_folder, replace=True)
 
 
-def is_multirun(arguments: Sequence[str]) -> bool:
-    """Whether the command line asks for a sweep."""
-    return bool(MULTIRUN_FLAGS & set(arguments))
-
-
 def check_command_line(
-    arguments: Sequence[str],
+    line: CommandLine,
     *,
     config_name: str,
     check: Callable[[DictConfig, Sequence[str]], object],
     folders: tuple[str, str],
     check_searchable: Callable[[DictConfig], object] | None = None,
-) -> None:
-    """Check every job that the arguments stand for, and do none; with other flags, such as --help, nothing.
+) -> CommandLine:
+    """Check every job that a command line stands for, and do none.
+
+    With a flag that shows something, such as --help, the settings are checked, and nothing is built.
 
     Args:
-        arguments: As typed, without the program's name.
+        line: As typed.
         config_name: The configuration that the overrides are for.
         check: Builds what a job needs, from its configuration and overrides, or raises one of
             ``CONFIGURATION_ERRORS``.
         folders: Where a run and a sweep write, unless the arguments say it.
         check_searchable: Raises if a job returns nothing that a search could go by; None if none does.
 
+    Returns:
+        The same with a folder that is this command's alone: where the settings name it by the time, it is made
+        here, and a second command of the same second gets another.
+
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
     """
-    multirun = is_multirun(arguments)
-    overrides = _as_overrides(arguments)
-    if overrides is None:
-        return
-    _check_writable(overrides, *(("hydra.sweep.dir", folders[1]) if multirun else ("hydra.run.dir", folders[0])))
+    if {"--shell-completion", "--hydra-help"} & set(line.shows):
+        return line
+    overrides = list(line.overrides)
+    if line.config_dir is not None:
+        _check_groups(line.config_dir)
+        overrides = _with_search_path(overrides, line.config_dir)
+    key = "hydra.sweep.dir" if line.multirun else "hydra.run.dir"
+    if not line.shows:
+        _check_writable(Path(line.value(key) or folders[line.multirun]), key)
+    folder: str | None = None
     with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
         paths = search_paths(overrides)
         try:
-            jobs, searches = [list(overrides)], False
-            if not multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
+            _check_options(overrides, config_name, paths)
+            jobs, searches = [overrides], False
+            if not line.multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
                 raise UserError("a search is a multirun: add -m.")
-            if multirun:
-                jobs, searches = planned_jobs(overrides, config_name=config_name)
+            if line.multirun:
+                jobs, searches, folder = planned_jobs(overrides, config_name=config_name)
                 if searches and check_searchable is None:
                     raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
         except CONFIGURATION_ERRORS as error:
@@ -90,18 +102,68 @@ def check_command_line(
         for job in jobs:
             try:
                 config = _composed(config_name, job, paths)
+                if not line.multirun:
+                    folder = named_by_time(config.hydra.run)
+                if line.shows:
+                    _check_package(config, line.package)
+                    continue
+                with open_dict(config):
+                    del config["hydra"]
                 if searches and check_searchable is not None:
                     check_searchable(config)
                 check(config, job)
-            except CONFIGURATION_ERRORS as error:
-                where = f" (job {' '.join(job)})" if multirun else ""
-                raise UserError(explain(error) + where) from error
+            except Exception as error:
+                message = _of_another_kind(config_name, job, paths)
+                if message is None and not isinstance(error, CONFIGURATION_ERRORS):
+                    raise
+                where = f" (job {' '.join(job)})" if line.multirun else ""
+                raise UserError((message or _naming_override(explain(error), job)) + where) from error
+    if line.shows or line.value(key) is not None or folder is None:
+        return line
+    return line.writing_to(claimed(Path(folder)), key)
+
+
+@contextmanager
+def answering(line: CommandLine) -> Iterator[None]:
+    """Turn what Hydra raises on a checked command line into one line, and take an unused folder away again.
+
+    Raises:
+        UserError: In place of Hydra's own errors.
+    """
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error)) from error
+    except ValueError as error:
+        if not line.shows:
+            raise
+        raise UserError(" ".join(str(error).split())) from error
+    finally:
+        if line.claimed is not None:
+            with suppress(OSError):  # it is in use
+                line.claimed.rmdir()
+
+
+def claimed(folder: Path) -> Path:
+    """Make a folder that nobody else has made: ``folder``, or the first free of ``folder_2``, ``folder_3``."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            path = folder if number == 1 else folder.with_name(f"{folder.name}_{number}")
+            try:
+                path.mkdir()
+            except FileExistsError:
+                continue
+            return path
+    except OSError as error:
+        raise UserError(f"folder {folder} cannot be made ({error.strerror}).") from error
+    raise AssertionError
 
 
 def _composed(config_name: str, job: Sequence[str], paths: Sequence[str]) -> DictConfig:
-    """The configuration of a job; where there is none, and a name is not known, say which are."""
+    """The configuration of a job, and Hydra's; where there is none, and a name is not known, say which are."""
     try:
-        return compose(config_name, list(job))
+        return compose(config_name, list(job), return_hydra_config=True)
     except CONFIGURATION_ERRORS:
         groups = GlobalHydra.instance().config_loader().list_groups("")
         plain = compose(config_name, list(paths))
@@ -111,22 +173,78 @@ def _composed(config_name: str, job: Sequence[str], paths: Sequence[str]) -> Dic
         raise
 
 
-def _as_overrides(arguments: Sequence[str]) -> list[str] | None:
-    """The overrides, with a ``--config-dir`` as one of them; None if there are other flags than of multirun."""
-    overrides, flags = [], set()
-    left = iter(arguments)
-    for argument in left:
-        name, equals, value = argument.partition("=")
-        if name in ("--config-dir", "-cd"):
-            folder = Path(value if equals else next(left, "")).absolute()
-            _check_groups(folder)
-            overrides.append(_searching(f"file://{folder}"))
-        elif argument.startswith("-"):
-            flags.add(argument)
-        else:
-            overrides.append(argument)
-    one_path = len(search_paths(overrides)) <= 1
-    return overrides if flags <= MULTIRUN_FLAGS and one_path else None
+def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[str]) -> None:
+    """Refuse what no group can be: taken away, added to itself, or given something else than an option's name."""
+    parsed = [parse(override) for override in overrides]
+    if not any(o.key_or_group and "." not in o.key_or_group for o in parsed):
+        return
+    loader = GlobalHydra.instance().config_loader()
+    groups = loader.list_groups("")
+    plain = compose(config_name, list(paths), return_hydra_config=True)
+    for override in parsed:
+        name, typed = override.key_or_group, override.input_line
+        if "/" in name or "@" in name or override.package is not None:
+            continue
+        known = f"Known here: {', '.join(loader.get_group_options(name))}." if name in groups else ""
+        if override.is_delete() and name in plain:
+            instead = f"Choose another option with {name}=NAME. {known}" if known else f"Give it: {name}=VALUE."
+            raise UserError(f"{typed} is not possible: {name} is needed. {instead}")
+        if (
+            name in groups
+            and name in plain.hydra.runtime.choices
+            and (override.is_add() or override.is_force_add())
+        ):
+            raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
+        if name in groups and not override.is_delete() and not override.is_sweep_override():
+            value = override.value()
+            allowed = value is None and plain.hydra.runtime.choices.get(name) is None
+            if not (isinstance(value, str | list) or allowed):
+                raise UserError(f"{typed} is not possible: {name} is given the name of an option. {known}")
+
+
+def _check_package(config: DictConfig, package: str | None) -> None:
+    if package not in (None, "_global_") and OmegaConf.select(config, package) is None:
+        known = ", ".join(str(key) for key in config)
+        raise UserError(f"--package {package}: there is no such part. Known here: {known}.")
+
+
+def _of_another_kind(config_name: str, job: Sequence[str], paths: Sequence[str]) -> str | None:
+    """Return a message if an override gives one value where a list or settings by name are expected."""
+    try:
+        defaults = compose(config_name, [*paths, *(o for o in job if _chooses_group(o))])
+    except CONFIGURATION_ERRORS:
+        return None
+    for override in job:
+        name, equals, text = override.partition("=")
+        name = name.lstrip("+")
+        if not equals or "." not in name or name.startswith("hydra."):
+            continue
+        before, value = OmegaConf.select(defaults, name), parse(override).value()
+        if isinstance(before, ListConfig) and not isinstance(value, list | NoneType):
+            return f"{name} = {value!r} is not allowed: expected a list. Write {name}=[{text.strip('()')}]"
+        if isinstance(before, DictConfig) and not isinstance(value, dict | NoneType):
+            known = ", ".join(f"{name}.{key!s}" for key in before)
+            return f"{name} = {value!r} is not allowed: expected settings by name. Known here: {known}."
+    return None
+
+
+def _naming_override(message: str, job: Sequence[str]) -> str:
+    """A message that names the override it is about, where a library repeats the value alone."""
+    if " is not allowed: expected " in message:  # our own
+        return message
+    given = {o: o.lstrip("+~").partition("=")[::2] for o in job}
+    if any(name in message or f"{name.rpartition('.')[0] or name}:" in message for name, _ in given.values()):
+        return message
+    meant = {
+        override: value
+        for override, (name, value) in given.items()
+        if value and not is_path(name) and re.search(rf"(?<!\w){re.escape(value)}(?!\w)", message)
+    }
+    if len(meant) != 1:
+        return message
+    ((override, value),) = meant.items()
+    remedy = " Write true or false." if value.lower() in ("yes", "no", "on", "off") else ""
+    return f"{override}: {message}{remedy}"
 
 
 def _check_groups(folder: Path) -> None:
@@ -160,10 +278,17 @@ def _searching(*places: str) -> str:
     return f"{_SEARCH_PATH}{list(places)}"
 
 
-def _check_writable(overrides: Sequence[str], key: str, default: str) -> None:
+def _with_search_path(overrides: Sequence[str], folder: Path) -> list[str]:
+    """The overrides with a folder of ``--config-dir`` as one of the places where they look for groups."""
+    given = search_paths(overrides)
+    places = parse(given[-1]).value() if given else []
+    assert isinstance(places, list)
+    return [_searching(f"file://{folder}", *map(str, places)), *(o for o in overrides if o not in given)]
+
+
+def _check_writable(folder: Path, key: str) -> None:
     """Raise unless a file can be made where the run folder will be."""
-    given = dict(override.split("=", 1) for override in overrides if override.startswith(f"{key}="))
-    folder = Path(given.get(key, default).strip("'\"")).absolute()
+    folder = folder.absolute()
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     try:
         with tempfile.TemporaryFile(dir=existing):

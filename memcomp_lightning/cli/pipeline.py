@@ -15,6 +15,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
+from memcomp_lightning.cli.arguments import as_typed
 from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import instantiate
@@ -165,7 +166,7 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
             f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes, by a "
             "limit of the trainer or a callback: its weights are not recorded as trained. Give it fewer passes "
             f"({stage.module.stage}.iterations), or lift the limit and go on with "
-            f"resume={short_path(folder.path)}, from the last checkpoint "
+            f"{as_typed('memcomp-train', f'resume={short_path(folder.path)}')}, from the last checkpoint "
             f"(checkpoint_every={config.checkpoint_every})."
         )
     return trainer
@@ -217,7 +218,8 @@ def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]
     for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
         metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
     for layer, value in enumerate(final_log_likelihoods(result), start=1):
-        metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
+        if value:  # no callback measured it
+            metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
     metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
     write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)
     for logger in loggers:

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import memcomp_lightning
 from memcomp_lightning import __version__
+from memcomp_lightning.cli.arguments import is_path
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.files import write_text
 
@@ -58,6 +59,11 @@ class RunFolder:
         found = self._read("overrides.json")
         return None if found is None else list(found["overrides"])
 
+    @property
+    def typed_in(self) -> Path:
+        """Where that command was typed: its relative paths are meant from there."""
+        return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
+
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
         """Make the folder, or check that it belongs to the same settings.
 
@@ -70,7 +76,7 @@ class RunFolder:
             if settings.exists():
                 self._check_same(settings, config)
             else:
-                self._write("overrides.json", {"overrides": list(overrides)})
+                self._write("overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
                 write_text(settings, OmegaConf.to_yaml(config))
         except OSError as error:
             raise UserError(
@@ -118,11 +124,18 @@ class RunFolder:
     def _check_same(self, path: Path, config: DictConfig) -> None:
         there, now = _flat(OmegaConf.load(path)), _flat(config)
         for name in sorted(there.keys() | now.keys()):
-            if there.get(name) != now.get(name) and not name.startswith(_FREE_TO_CHANGE):
+            if name.startswith(_FREE_TO_CHANGE) or there.get(name) == now.get(name):
+                continue
+            if not self._same_path(name, there.get(name), now.get(name)):
                 raise UserError(
                     f"run folder {self.path} was made with {name}={there.get(name)}, not {now.get(name)}: choose "
                     "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
                 )
+
+    def _same_path(self, name: str, there: Any, now: Any) -> bool:
+        """Whether a path of then, meant from where it was typed, is one of now."""
+        paths = is_path(name) and isinstance(there, str) and isinstance(now, str)
+        return paths and self.typed_in / there == Path.cwd() / now
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:

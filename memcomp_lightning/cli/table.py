@@ -1,6 +1,7 @@
 """Results as short tables."""
 
 import math
+import shlex
 import shutil
 import sys
 from collections.abc import Sequence
@@ -85,7 +86,7 @@ def closing_lines(folder: Path) -> str:
         return place
     beside_python = Path(sys.executable).parent / "tensorboard"
     command = "tensorboard" if shutil.which("tensorboard") else short_path(beside_python)
-    return f"{place}\nTensorBoard:  {command} --logdir '{folder}'"
+    return f"{place}\nTensorBoard:  {shlex.join([str(command), '--logdir', str(folder)])}"
 
 
 def short_path(path: Path) -> Path:

@@ -10,9 +10,9 @@ from omegaconf import DictConfig
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.build import Plan, build
+from memcomp_lightning.cli.commands.report import save
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.hydra_versions import instantiate
-from memcomp_lightning.cli.report import save
 from memcomp_lightning.cli.units import pretrained
 from memcomp_lightning.dmm import DmmSolver, Recording
 from memcomp_lightning.errors import SettingError, require

@@ -1,5 +1,6 @@
 """Processes that train many networks."""
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -14,6 +15,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from memcomp_lightning import compiling
 from memcomp_lightning.cli.units import Progress, device_of
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.report.records import JsonLines
@@ -63,6 +65,8 @@ def run_all(run: Runner, units: Sequence[Any], records: JsonLines[Any], name: st
         def show(what: str, n_updates: int) -> None:
             bar.set_description(f"{name}: {what}", refresh=False)
             bar.update(n_updates)
+            if n_updates == 0:
+                bar.refresh()
 
         for found in run(units, show):
             records.append(found)
@@ -93,6 +97,11 @@ def _begin_worker(messages: Any) -> None:
     global _messages
     _messages = messages
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
+    tell = logging.Handler()
+    tell.emit = lambda record: messages.put((record.getMessage(), 0))  # type: ignore[method-assign]
+    log = logging.getLogger(compiling.__name__)
+    log.addHandler(tell)
+    log.setLevel(logging.INFO)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     torch.set_num_threads(1)
 

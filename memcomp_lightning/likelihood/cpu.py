@@ -6,9 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from memcomp_lightning.compiling import announce_compilation
 from memcomp_lightning.likelihood.kernel import PACK, sum_over_second
 from memcomp_lightning.likelihood.layers import Layers
 from memcomp_lightning.models.enumeration import binary_states
+
+announce_compilation()
 
 Array = np.ndarray[Any, Any]
 

@@ -43,6 +43,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: The file is missing, truncated, or holds more than tensors and plain values.
     """
+    if path.is_dir():
+        raise CheckpointError(
+            f"checkpoint {path} is a folder: name a file in it, as in {path}/weights/pretrain.pt."
+        )
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist.")
     try:

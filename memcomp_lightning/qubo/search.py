@@ -5,6 +5,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from memcomp_lightning.compiling import announce_compilation
+
+announce_compilation()
+
 
 @njit(fastmath=True, cache=True, nogil=True)
 def search(weight: Any, linear: Any, other: Any, best: float, max_nodes: int) -> Any:

@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from running import Outcome, launch
 
 import memcomp_lightning
-from memcomp_lightning.cli import solve, sweep, train
+from memcomp_lightning.cli import report, solve, sweep, train
 
 RunCommand = Callable[[str, Callable[[], None], tuple[str, ...]], Outcome]
 
@@ -45,6 +45,12 @@ def memcomp_train(run_command: RunCommand) -> Callable[..., Outcome]:
 def memcomp_solve(run_command: RunCommand) -> Callable[..., Outcome]:
     """Run ``memcomp-solve`` in this process, in a folder of its own."""
     return lambda *arguments: run_command("memcomp-solve", solve.main, arguments)
+
+
+@pytest.fixture
+def memcomp_report(run_command: RunCommand) -> Callable[..., Outcome]:
+    """Run ``memcomp-report`` in this process, in a folder of its own."""
+    return lambda *arguments: run_command("memcomp-report", report.main, arguments)
 
 
 @pytest.fixture

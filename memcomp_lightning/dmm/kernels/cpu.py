@@ -1,6 +1,5 @@
 """The compiled kernels: hand tensors to numba and share the restarts among threads."""
 
-import logging
 import os
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from memcomp_lightning.compiling import announce_compilation
 from memcomp_lightning.dmm.base import Recording
 from memcomp_lightning.dmm.bond import BondField, BondMachine
 from memcomp_lightning.dmm.clause import ClauseField, ClauseMachine
@@ -25,7 +25,7 @@ from memcomp_lightning.qubo.graph import Bipartite
 from memcomp_lightning.qubo.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.qubo.qubo import Qubo
 
-log = logging.getLogger(__name__)
+announce_compilation()
 
 Array = np.ndarray[Any, Any]
 Field = ClauseField | BondField
@@ -127,7 +127,7 @@ def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
     scalars = np.empty((n_problems, 3))
     kind = BOND if isinstance(field, BondField) else 1 - BOND
     given = [np.ascontiguousarray(x.detach().double().numpy()) for x in (problem.coupling, problem.linear)]
-    _announce(prepare)
+    _forget_outdated(prepare)
     compiled: Any = prepare
     compiled(kind, width, height, *given, weight, unit, scalars, coupling, transposed, linear)
     side = np.where(2 * np.arange(width) < n_first, np.float32(0.5), np.float32(-0.5))
@@ -332,7 +332,7 @@ def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -
 
     Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
     """
-    _announce(kernel)
+    _forget_outdated(kernel)
     stop = np.zeros(1, np.uint8)
     n_threads = min(torch.get_num_threads(), n_items)
     if n_threads <= 1 and work < _SHORT:
@@ -356,14 +356,14 @@ _SHORT = 2e8
 
 
 @cache
-def _announce(kernel: Any) -> None:
-    """Say once that the first call compiles, if nothing is cached on disk."""
+def _forget_outdated(kernel: Any) -> None:
+    """Remove cached code of the disk that numba would take for new.
+
+    It compiles anew when a function's own file changes, not when what it inlines does.
+    """
     folder, module = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
-    # numba compiles anew when a function's own file changes, not when what it inlines does.
     inlined = Path(common.__file__).stat().st_mtime
     for index in folder.glob(f"{module}.*.nbi"):
         with suppress(FileNotFoundError):  # another process was first
             if index.stat().st_mtime < inlined:
                 index.unlink()
-    if not any(folder.glob(f"{module}.{kernel.__name__}*.nbi")):
-        log.warning("Compiling the DMM kernel for this processor, once (about half a minute); kept in %s", folder)

@@ -1,0 +1,233 @@
+"""``memcomp-train``: pretrain, fine-tune, evaluate."""
+
+import logging
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning_utilities.core.rank_zero import rank_zero_only
+from omegaconf import DictConfig
+
+from memcomp_lightning.cli import figures, pipeline, sweep, trajectory, worth
+from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
+from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.choice import for_trial, settle, tried_values
+from memcomp_lightning.cli.commands import report
+from memcomp_lightning.cli.errors import UserError, explain, refuse
+from memcomp_lightning.cli.hydra_versions import MAIN
+from memcomp_lightning.cli.output import make_tolerant, say
+from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, search_path
+from memcomp_lightning.cli.run_folder import RunFolder
+from memcomp_lightning.cli.search import check_searchable
+from memcomp_lightning.cli.table import closing_lines, run_table, short_path
+from memcomp_lightning.errors import SettingError, require
+from memcomp_lightning.modules import CheckpointError, DivergedError
+
+COMMAND = "memcomp-train"
+
+log = logging.getLogger(__name__)
+
+
+@hydra.main(config_path=f"pkg://{CONFIG_MODULE}", config_name="config", **MAIN)
+def train(config: DictConfig) -> float | None:
+    """One run, or one job of a sweep.
+
+    Returns:
+        What a search goes by: accuracy on held-out training images after the last pass, mean over replicas; 0 of a
+        job that diverged. None where no images are held out, or a job failed.
+    """
+    settings = HydraConfig.get()
+    _begin_job(settings.runtime.cwd)
+    folder = RunFolder(Path(settings.runtime.output_dir))
+    in_sweep = settings.mode == RunMode.MULTIRUN
+    try:
+        return _train(config, folder, [*search_path(settings), *settings.overrides.task])
+    except Exception as error:
+        if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
+            refuse(COMMAND, error)
+        if not in_sweep:
+            raise
+        folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
+        log.error("Failed, the sweep goes on: %s", explain(error))
+        return 0.0 if isinstance(error, DivergedError) else None
+
+
+def _check(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Build a job, and train nothing."""
+    if config.worth is not None:
+        worth.check(config, overrides)
+        return
+    if config.figure is not None:
+        if not {"name", "all"} & set(config.figure):
+            raise UserError(
+                "preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick."
+            )
+        for part, own in figures.parts(config, overrides).values():
+            check = trajectory.prepare if "curves" not in part.figure else figures.check
+            check(part, own)
+        return
+    for name, logger in config.logger.items():
+        writes_events = logger is not None and str(logger.get("_target_")).endswith("TensorBoardLogger")
+        if writes_events and find_spec("tensorboard") is None:
+            raise UserError(
+                f"logger.{name}: TensorBoard is not installed: pip install tensorboard, or logger=csv."
+            )
+    values = tried_values(config)
+    n_passes = config.finetune.iterations
+    require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
+    plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
+    try:
+        trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
+    except MisconfigurationException as error:
+        raise UserError(explain(error)) from error
+    for stage in plans[0].stages:
+        stage.data.train_batches(0, trainer.world_size)
+
+
+def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float | None:
+    if config.figure is not None or config.worth is not None:
+        _many(config, folder, overrides)
+        return None
+    if _is_first_process():
+        folder.open(config, overrides)
+    result = folder.result
+    if result is None:
+        try:
+            config, choice = settle(config, folder)
+            result = pipeline.run(build(config), config, folder, _by_name(overrides), choice)
+        except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
+            raise KeyboardInterrupt(_go_on(folder)) from stop
+    else:
+        log.info("%s is finished already", folder.path)
+    if _is_first_process():
+        say(f"\n{run_table(result)}\n{closing_lines(short_path(folder.path))}")
+    held_out = result.get("validation_accuracy")
+    return sum(held_out) / len(held_out) if held_out else None
+
+
+def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
+    """Train what a figure or a comparison needs, and write the report."""
+    folder.open(config, overrides)
+    folder.check_source()
+    try:
+        if config.worth is not None:
+            worth.train_worth(config, overrides, folder.path)
+            trained = [folder.path]
+        else:
+            trained = []
+            for name, (part, own) in figures.parts(config, overrides).items():
+                trained.append(folder.path / name)
+                trained[-1].mkdir(exist_ok=True)
+                train = trajectory.train_trajectory if "curves" not in part.figure else figures.train_curves
+                train(part, own, trained[-1])
+        report.main([*map(str, trained), "--output", str(folder.report)])
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(_go_on(folder)) from stop
+    folder.forget_error()
+
+
+def _go_on(folder: RunFolder) -> str:
+    return f"Go on with: {as_typed(COMMAND, f'resume={short_path(folder.path)}')}"
+
+
+def _is_first_process() -> bool:
+    """Whether this is the process that writes; Lightning reads the rank from the environment."""
+    return int(getattr(rank_zero_only, "rank", 0)) == 0
+
+
+def _by_name(overrides: list[str]) -> dict[str, str]:
+    pairs = (override.partition("=") for override in overrides if not override.startswith("hydra."))
+    return {name: value for name, _, value in pairs}
+
+
+def _resumed(arguments: list[str]) -> list[str]:
+    """Put the overrides and the folder of an earlier run in place of ``resume=FOLDER``."""
+    folders = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
+    if not folders:
+        return arguments
+    name = unquoted(folders[-1])
+    if not name:
+        raise UserError("resume= names no folder: write resume=FOLDER, the folder of a run of memcomp-train.")
+    if {"-m", "--multirun"} & set(arguments):
+        raise UserError(
+            f"resume={name} goes on with one run, without -m; a sweep goes on when the same command is given with "
+            "hydra.sweep.dir=FOLDER."
+        )
+    folder = RunFolder(Path(expanded("resume", name)))
+    overrides = folder.overrides
+    if overrides is None:
+        raise UserError(
+            f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
+            "sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
+        )
+    others = [argument for argument in arguments if not argument.startswith("resume=")]
+    return [
+        *(from_folder(o, folder.typed_in) for o in overrides),
+        *others,
+        with_path("hydra.run.dir", folder.path),
+    ]
+
+
+def main() -> None:
+    """Check everything, train, and end with a table or a message."""
+    _silence_lightning()
+    try:
+        if "LOCAL_RANK" not in os.environ:
+            line = check_command_line(
+                _read(sys.argv[1:]),
+                config_name="config",
+                check=_check,
+                folders=("runs", "multirun"),
+                check_searchable=check_searchable,
+            )
+            sys.argv[1:] = line.arguments
+            with answering(line):
+                train()
+        else:
+            train()
+    except UserError as error:
+        refuse(COMMAND, error)
+    except KeyboardInterrupt as interrupt:
+        if sweep.RememberSweepFolder.folder is not None:
+            raise KeyboardInterrupt(f"Go on with: {as_typed(COMMAND, *sys.argv[1:])}") from interrupt
+        raise
+    if (folder := sweep.RememberSweepFolder.folder) is not None:
+        table, n_failed = sweep.merge(folder)
+        say(f"\n{table}\n{closing_lines(short_path(folder))}")
+        sys.exit(1 if n_failed else 0)
+
+
+def _read(arguments: list[str]) -> CommandLine:
+    line = read(_resumed(arguments))
+    devices = line.value("trainer.devices")
+    if line.multirun and devices not in (None, "1"):
+        raise UserError(
+            "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
+            "processes. Give the jobs one by one, or use one device with a parallel launcher."
+        )
+    return line
+
+
+def _begin_job(folder: str) -> None:
+    """What a job needs in a process of its own, which a parallel launcher starts, and in the first one.
+
+    Args:
+        folder: Where the command was typed: paths are meant from there, with ``hydra.job.chdir=true``, too.
+    """
+    make_tolerant()
+    _silence_lightning()
+    os.chdir(folder)
+
+
+def _silence_lightning() -> None:
+    """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)

@@ -1,0 +1,146 @@
+"""What a command prints: a line that cannot be printed is lost alone, never the work that it tells of."""
+
+import codecs
+import errno
+import io
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from memcomp_lightning import compiling
+
+_PLAIN = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{PLUS-MINUS SIGN}": "+-", "\N{MIDDLE DOT}": "*"}
+"""Signs of our tables in an encoding that has none of them."""
+
+
+def say(text: str = "", *, error: bool = False) -> None:
+    """Print a text at once, on standard error if ``error``."""
+    # The reader has gone, the disk is full, the stream is closed, or cannot spell it.
+    with suppress(OSError, ValueError):
+        print(text, file=sys.stderr if error else sys.stdout, flush=True)
+
+
+@contextmanager
+def tolerant_streams() -> Iterator[list[OSError]]:
+    """Let standard output and error take everything; yield a list that collects why some of it was not written.
+
+    Libraries print, too: loggers, progress bars, Hydra. Where the streams are closed, ``os.devnull`` takes their
+    place, so that no file of the run is opened under their numbers.
+    """
+    before, failures = (sys.stdout, sys.stderr), make_tolerant()
+    try:
+        yield failures
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def make_tolerant() -> list[OSError]:
+    """Do the same for the rest of this process, which a launcher may have started; return the list."""
+    codecs.register_error("readable", _spelt_out)
+    failures: list[OSError] = []
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            _occupy(number)
+            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
+        elif type(stream) is io.TextIOWrapper:  # no others, such as a notebook's
+            setattr(sys, name, _tolerant(stream, failures if number == 1 else []))
+            _hand_over(stream, getattr(sys, name))
+    return failures
+
+
+class _Tolerant(io.RawIOBase):
+    """A raw stream that reports everything as written, and keeps the first reason why something was not."""
+
+    def __init__(self, raw: Any, name: str, failures: list[OSError]) -> None:
+        self._raw, self.name, self.failures = raw, name, failures
+
+    def write(self, data: Any) -> int:
+        size = memoryview(data).nbytes
+        try:
+            written: int | None = self._raw.write(data)
+        except (OSError, ValueError) as error:
+            if not self.failures:
+                self.failures.append(error if isinstance(error, OSError) else OSError(errno.EBADF, str(error)))
+            return size
+        return size if written is None else written
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return int(self._raw.fileno())
+
+    def isatty(self) -> bool:
+        return bool(self._raw.isatty())
+
+
+def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWrapper:
+    buffer: Any = stream.buffer
+    raw = getattr(buffer, "raw", buffer)
+    if isinstance(raw, _Tolerant):
+        return stream
+    _flush(stream)
+    tolerant: Any = _Tolerant(raw, stream.name, failures)
+    if raw is not buffer:  # not under python -u
+        tolerant = io.BufferedWriter(tolerant)
+    return io.TextIOWrapper(
+        tolerant,
+        encoding=stream.encoding,
+        errors="readable",
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
+def _flush(stream: io.TextIOWrapper) -> None:
+    with suppress(OSError, ValueError):
+        stream.flush()
+
+
+def _hand_over(stream: io.TextIOWrapper, tolerant: io.TextIOWrapper) -> None:
+    """Let log handlers that were made before write to the new stream."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.StreamHandler) and handler.stream is stream:
+            handler.setStream(tolerant)
+
+
+def _occupy(number: int) -> None:
+    """Open ``os.devnull`` under the number of a closed stream."""
+    try:
+        os.fstat(number)
+    except OSError:
+        opened = os.open(os.devnull, os.O_RDWR)
+        if opened != number:
+            os.dup2(opened, number)
+            os.close(opened)
+
+
+def _spelt_out(error: UnicodeError) -> tuple[str, int]:
+    """An error handler for encoders: signs of tables by plain ones, others as backslash and code."""
+    assert isinstance(error, UnicodeEncodeError)
+    signs = error.object[error.start : error.end]
+    return "".join(_PLAIN.get(s, s.encode("ascii", "backslashreplace").decode()) for s in signs), error.end
+
+
+@contextmanager
+def compilation_told(command: str) -> Iterator[None]:
+    """Print what ``compiling`` logs, before Hydra has set up logging as well as after it, as one plain line."""
+    log, handler = logging.getLogger(compiling.__name__), logging.Handler()
+    handler.emit = lambda record: say(f"{command}: {record.getMessage()}", error=True)  # type: ignore[method-assign]
+    before = log.level, log.propagate
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before[0])
+        log.propagate = before[1]
