@@ -1,7 +1,7 @@
 """The Boltzmann machine: visible and hidden units with any symmetric connectivity."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -64,7 +64,8 @@ class BoltzmannMachine(nn.Module):
     or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent units.
 
     Attributes:
-        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first.
+        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first; part of the state dict, so that
+            weights go into a machine of the same pairs alone.
         coupling: w, one number a pair, ``(*replicas, n_pairs)``.
         b: Visible bias, ``(*replicas, n_visible)``.
         c: Hidden bias, ``(*replicas, n_hidden)``.
@@ -120,7 +121,7 @@ class BoltzmannMachine(nn.Module):
         )
         generator = stream(0, "weights") if generator is None else generator
         self.pairs: Tensor
-        self.register_buffer("pairs", pairs, persistent=False)
+        self.register_buffer("pairs", pairs)
         draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
         self.coupling = nn.Parameter(draw)
         self.b = nn.Parameter(torch.zeros(*replicas, n_visible))
@@ -131,6 +132,32 @@ class BoltzmannMachine(nn.Module):
             self._n_forward.append(layout.n_forward)
             for name in _INDICES:
                 self.register_buffer(f"_{name}{number}", getattr(layout, name), persistent=False)
+
+    def other_pairs(self, pairs: Tensor | None) -> str:
+        """Say what speaks against couplings of these pairs in this machine; empty if nothing does.
+
+        Args:
+            pairs: Those of a weight file; None if it has none, as files of version 0.1, which is understood where
+                the number of units says what they are.
+        """
+        if pairs is None:
+            known = len(self.pairs) == self.n_units * (self.n_units - 1) // 2
+            return "" if known else "the couplings are of unknown pairs, because the file does not hold them."
+        if self.pairs.equal(pairs.to(self.pairs)):
+            return ""
+        own, given = ({tuple(pair) for pair in some.tolist()} for some in (self.pairs, pairs))
+        only = min(given ^ own, default=())
+        where = "the file" if only in given else "this machine"
+        return f"the couplings are of other pairs of units: {only} is coupled in {where} alone."
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        """Refuse couplings of other pairs."""
+        name = f"{prefix}pairs"
+        *_, error_messages = arguments
+        if reason := self.other_pairs(state_dict.get(name)):
+            error_messages.append(reason)
+        state_dict[name] = self.pairs
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def _initial(
         self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
