@@ -51,6 +51,8 @@ class Pictures(EveryIterations):
             return
         tiles = self.tiles(pl_module, outputs)
         first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
+        if not len(first_replica):  # receptive fields of no hidden units
+            return
         grid = picture_grid(layout.to_picture(first_replica).float().cpu().numpy())
         for board in boards:
             tag = f"{prefix_of(pl_module)}/{self.tag}"
@@ -107,7 +109,8 @@ class ModelSamples(Pictures):
         x = chains.random(self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
             x = chains.sweep(x, generator=generator)
-        return _images(pl_module, rbm.visible_mean(chains.read(x).h))
+        states = chains.read(x)
+        return _images(pl_module, rbm.visible_mean(states.h) if rbm.n_hidden else states.v)
 
 
 class ChainPictures(Pictures):

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
+from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
@@ -91,6 +92,7 @@ class BoltzmannMachine(nn.Module):
     torch.Size([5])
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         n_visible: int,
@@ -124,8 +126,8 @@ class BoltzmannMachine(nn.Module):
         self.register_buffer("pairs", pairs)
         draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
         self.coupling = nn.Parameter(draw)
-        self.b = nn.Parameter(torch.zeros(*replicas, n_visible))
-        self.c = nn.Parameter(torch.zeros(*replicas, n_hidden))
+        self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
+        self.c = nn.Parameter(draw.new_zeros(*replicas, n_hidden))
         classes = sorted(colouring(n_units, pairs), key=lambda units: -int((units < n_visible).sum()))
         self._n_forward: list[int] = []
         for number, layout in enumerate(_layouts(n_units, pairs, classes)):
@@ -237,6 +239,7 @@ class BoltzmannMachine(nn.Module):
         """Mean of E over configurations, by their weights."""
         return self.total_energy(configurations.v, configurations.h, shares(configurations))
 
+    @in_own_dtypes
     def total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],
@@ -250,6 +253,7 @@ class BoltzmannMachine(nn.Module):
         total: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
         return total
 
+    @in_own_dtypes
     def centred_total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],
@@ -345,9 +349,9 @@ def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | N
 
 
 def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Layout]:
-    colour, place = torch.empty(n_units, dtype=torch.long), torch.empty(n_units, dtype=torch.long)
+    colour, place = pairs.new_empty(n_units), pairs.new_empty(n_units)
     for number, units in enumerate(classes):
-        colour[units], place[units] = number, torch.arange(len(units))
+        colour[units], place[units] = number, torch.arange(len(units), device=pairs.device)
     found = []
     for number, units in enumerate(classes):
         ends, edges = [], []

@@ -12,6 +12,7 @@ from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
 from memcomp_lightning.objective import Centring, Offsets, contrast
@@ -135,10 +136,13 @@ class EnergyPretraining(StageModule):
             self._begun_at.append(self.current_epoch)
         if self.iteration == 0:
             self._sampler_state, self._offsets = None, None
-            self.energy_gaps = [*self.energy_gaps, torch.zeros(self.rbm.replicas)]
+            self.energy_gaps = [
+                *self.energy_gaps,
+                torch.zeros(self.rbm.replicas, dtype=torch.float32, device="cpu"),
+            ]
             for callback in self.trainer.early_stopping_callbacks:
                 callback.wait_count, callback.stopped_epoch = 0, 0
-                callback.best_score = torch.tensor(math.inf if callback.mode == "min" else -math.inf)
+                callback.best_score = torch.tensor(math.inf if callback.mode == "min" else -math.inf, device="cpu")
                 callback.monitor = self.monitored(callback.monitor)
 
     def on_train_epoch_end(self) -> None:
@@ -164,6 +168,7 @@ class EnergyPretraining(StageModule):
         """The name under which a value that somebody monitors is logged for the model in training."""
         return name
 
+    @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Follow the gradient of the contrast of both phases.
 
@@ -220,7 +225,7 @@ class EnergyPretraining(StageModule):
         return negative
 
     def _mean_over_processes(self, value: Tensor | float) -> Tensor:
-        value = torch.as_tensor(value)
+        value = torch.as_tensor(value, dtype=torch.float32) if isinstance(value, float) else value
         if self.trainer.world_size == 1:
             return value
         return cast(Tensor, self.trainer.strategy.reduce(value, reduce_op="mean"))
