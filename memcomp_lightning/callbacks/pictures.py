@@ -50,9 +50,9 @@ class Pictures(EveryIterations):
         if not boards or layout is None:
             return
         tiles = self.tiles(pl_module, outputs)
-        first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
-        if not len(first_replica):  # receptive fields of no hidden units
+        if not tiles.numel():  # receptive fields of no hidden units
             return
+        first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
         grid = picture_grid(layout.to_picture(first_replica).float().cpu().numpy())
         for board in boards:
             tag = f"{prefix_of(pl_module)}/{self.tag}"

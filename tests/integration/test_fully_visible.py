@@ -25,6 +25,7 @@ from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import BoltzmannPretraining
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.qubo import AlternatingDescent, BruteForce
+from memcomp_lightning.replicas import Rates, pretrain_machine
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -112,7 +113,9 @@ def test_every_positive_phase_of_no_hidden_units_is_the_data(positive: Any) -> N
 def test_learns_the_maximum_of_the_likelihood() -> None:
     """There pairs of units are on together as often as in the data (Ackley, Hinton & Sejnowski 1985)."""
     model, data = BoltzmannMachine(9, 0), bars()
-    fit(model, Exact(), data, iterations=1500, optimizer=partial(torch.optim.Adam, lr=0.05))
+    rates = Rates(partial(torch.optim.Adam, lr=0.1))
+    for _ in pretrain_machine(model, data.train_batches(0, 1), Exact(), MeanField(), iterations=300, rates=rates):
+        pass
     v = data.images.train_v
     states = binary_states(9, like=v)
     p = log_likelihood(model, states, log_partition_function(model)).exp().float()
