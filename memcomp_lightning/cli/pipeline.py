@@ -178,7 +178,8 @@ def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]
     for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
         metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
     for layer, value in enumerate(final_log_likelihoods(result), start=1):
-        metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
+        if value:  # none where nothing measures it
+            metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
     metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
     write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)
     for logger in loggers:
