@@ -23,7 +23,11 @@ from memcomp_lightning.modules.trainers import check_callback
 from memcomp_lightning.samplers import CD, PCD
 
 Run = Callable[..., Outcome]
-SHORT = ["sampler=cd", "pretrain.iterations=2", "finetune.iterations=2", "callbacks=minimal", "logger=none"]
+WHOLE = ["pretrain.batch_size=null", "finetune.batch_size=null"]
+SHORT = [
+    *("sampler=cd", "pretrain.iterations=2", "finetune.iterations=2", "callbacks=minimal", "logger=none"),
+    *WHOLE,
+]
 
 REFUSED: dict[str, Any] = {
     "logger": "false",
@@ -363,6 +367,7 @@ def test_the_table_and_the_record_say_after_how_many_passes(memcomp_train: Run) 
     criterion = "_target_: lightning.pytorch.callbacks.EarlyStopping, min_delta: 9, patience: 2, monitor"
     outcome = memcomp_train(
         "sampler=cd",
+        *WHOLE,
         "pretrain.iterations=9",
         "finetune.iterations=9",
         "logger=none",
