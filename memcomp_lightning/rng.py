@@ -50,8 +50,8 @@ def restore(generators: dict[str, Generator], states: dict[str, Tensor]) -> None
 
 
 def uniform(shape: Iterable[int], *, generator: Generator, like: Tensor | None = None) -> Tensor:
-    """Draw from U[0, 1), on the generator's device, then moved to the device and dtype of ``like``."""
-    draw = torch.empty(tuple(shape), device=generator.device, dtype=None if like is None else like.dtype)
+    """Draw from U[0, 1) on the generator's device, in float32 or the dtype of ``like``, moved to its device."""
+    draw = torch.empty(tuple(shape), device=generator.device, dtype=torch.float32 if like is None else like.dtype)
     draw.uniform_(generator=generator)
     return draw if like is None else draw.to(like.device)
 

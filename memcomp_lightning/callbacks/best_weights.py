@@ -57,6 +57,9 @@ class BestWeights(pl.Callback):
             accuracy = torch.where(better, accuracy, self.accuracy.to(accuracy))
         self.accuracy = accuracy
         for name, now in pl_module.state_dict().items():
+            if not now.is_floating_point():  # indices, which no replica has of its own
+                self._weights[name] = now.clone()
+                continue
             own = better.view((*better.shape, *[1] * (now.ndim - better.ndim)))
             self._weights[name] = torch.where(own, now, self._weights.get(name, now).to(now))
 

@@ -23,4 +23,6 @@ class ParameterHistograms(EveryIterations):
         model: Any = getattr(pl_module, "rbm", pl_module)
         for board in tensorboards(trainer):
             for name, parameter in model.named_parameters():
+                if not parameter.numel():  # biases of no hidden units
+                    continue
                 board.add_histogram(f"{prefix_of(pl_module)}/{name}", parameter.flatten(), trainer.global_step)

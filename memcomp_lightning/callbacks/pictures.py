@@ -50,6 +50,8 @@ class Pictures(EveryIterations):
         if not boards or layout is None:
             return
         tiles = self.tiles(pl_module, outputs)
+        if not tiles.numel():  # receptive fields of no hidden units
+            return
         first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
         grid = picture_grid(layout.to_picture(first_replica).float().cpu().numpy())
         for board in boards:
@@ -107,7 +109,8 @@ class ModelSamples(Pictures):
         x = chains.random(self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
             x = chains.sweep(x, generator=generator)
-        return _images(pl_module, rbm.visible_mean(chains.read(x).h))
+        states = chains.read(x)
+        return _images(pl_module, rbm.visible_mean(states.h) if rbm.n_hidden else states.v)
 
 
 class ChainPictures(Pictures):

@@ -96,7 +96,7 @@ class SaturationGuard(pl.Callback):
     def _stuck(trainer: pl.Trainer, outputs: Any) -> float:
         """Share of saturated hidden means in the worst replica, the same in every process."""
         positive = outputs.get("positive") if isinstance(outputs, dict) else None
-        if positive is None:
+        if positive is None or not positive.h.numel():
             return 0.0
         h = positive.h
         share = (torch.minimum(h, 1 - h) <= AT_AN_END).float().mean((-1, -2)).max()

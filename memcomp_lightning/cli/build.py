@@ -12,11 +12,12 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from hydra.utils import get_class
+from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import BestWeights, MomentumSchedule
+from memcomp_lightning.callbacks import BestWeights, MomentumSchedule, StageProgressBar
 from memcomp_lightning.cli.errors import UserError, in_words
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.overrides import check_finite, check_seed
@@ -31,6 +32,7 @@ from memcomp_lightning.modules import (
     OptimizerFactory,
     StageModule,
 )
+from memcomp_lightning.modules.trainers import check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
@@ -103,9 +105,7 @@ def build(config: DictConfig) -> Plan:
     check_finite(config)
     seed = config.seed
     check_seed(seed)
-    precision = str(config.trainer.precision)
-    allowed = "32-true, 64-true, 16-true or bf16-true: the stages step by themselves, and mix none"
-    require("mixed" not in precision and "transformer" not in precision, "trainer.precision", precision, allowed)
+    precision_of(config.trainer.precision)
     images = _loaded(instantiate(config.data.source))
     network = _network(config, images)
     for stage in ("pretrain", "finetune"):
@@ -214,10 +214,10 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
         network: nn.Module = factory(**arguments)
     except TypeError as error:
         raise UserError(f"model: {error}") from error
+    network.to(_DTYPES[precision_of(config.trainer.precision)])
     if weights is not None:
         require(isinstance(weights, str), "model.weights", weights, "the path of a weight file, or null")
         load_weights(network, Path(weights))
-    network.to(_PRECISIONS.get(str(config.trainer.precision), torch.float32))
     return network
 
 
@@ -270,6 +270,10 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
     for callback in callbacks:
         kind = type(callback).__name__
         require(isinstance(callback, pl.Callback), f"callbacks.{stage}", kind, "callbacks of Lightning")
+        check_callback(callback, f"callbacks.{stage}")
+    if any(isinstance(callback, ProgressBar) and type(callback) is not StageProgressBar for callback in callbacks):
+        # A trainer has one bar: the one that somebody chose takes the place of ours.
+        callbacks = [callback for callback in callbacks if type(callback) is not StageProgressBar]
     return callbacks
 
 
@@ -278,7 +282,12 @@ def given(callbacks: Mapping[Any, Any]) -> list[Any]:
     return [callback for callback in callbacks.values() if callback is not None]
 
 
-_PRECISIONS = {"64-true": torch.float64, "16-true": torch.float16, "bf16-true": torch.bfloat16}
+_DTYPES = {
+    "32-true": torch.float32,
+    "64-true": torch.float64,
+    "16-true": torch.float16,
+    "bf16-true": torch.bfloat16,
+}
 
 
 def _loaded(source: ImageSource) -> ImageData:

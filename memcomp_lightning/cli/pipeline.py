@@ -1,28 +1,27 @@
 """The stages of one run, each picked up where it was left."""
 
 import logging
-from pathlib import Path
 from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
-from memcomp_lightning.cli.arguments import as_typed
 from memcomp_lightning.cli.build import Plan, Stage
-from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import final_log_likelihoods, short_path
+from memcomp_lightning.cli.table import final_log_likelihoods
+from memcomp_lightning.cli.trainers import trainer_of
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
-from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import (
     BoltzmannPretraining,
@@ -30,11 +29,12 @@ from memcomp_lightning.modules import (
     DBMPretraining,
     DBNPretraining,
     EnergyPretraining,
+    NotTrainedError,
     evaluate,
     load_weights,
     save_weights,
 )
-from memcomp_lightning.modules.weights import AtomicCheckpointIO, check_fits, read_checkpoint
+from memcomp_lightning.modules.weights import check_checkpoint
 
 log = logging.getLogger(__name__)
 
@@ -95,81 +95,37 @@ def _between(plan: Plan, config: DictConfig) -> None:
         plan.between(plan.network, generator=rng.stream(config.seed, "between stages"))
 
 
-_SET_BY_STAGE = (
-    "max_epochs",
-    "callbacks",
-    "logger",
-    "use_distributed_sampler",
-    "enable_model_summary",
-    "num_sanity_val_steps",
-    "default_root_dir",
-    "plugins",
-)
-_NOT_WITH_OWN_STEPS = ("gradient_clip_val", "gradient_clip_algorithm", "accumulate_grad_batches")
-
-
-def make_trainer(
-    config: DictConfig, *, max_epochs: int, callbacks: list[pl.Callback], loggers: list[Logger], folder: Path
-) -> pl.Trainer:
-    """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group.
-
-    Raises:
-        SettingError, MisconfigurationException: A setting is not for the user to set, or out of range.
-    """
-    for name, value in config.trainer.items():
-        allowed = "nothing, each stage sets it"
-        require(name not in _SET_BY_STAGE, f"trainer.{name}", value, allowed, "Use the groups of the stages.")
-        allowed = "nothing, the stages step their optimisers themselves"
-        require(name not in _NOT_WITH_OWN_STEPS, f"trainer.{name}", value, allowed, "Use batch_size.")
-    settings = OmegaConf.to_container(config.trainer, resolve=True)
-    assert isinstance(settings, dict)
-    require_count("checkpoint_every", config.checkpoint_every)
-    trainer: pl.Trainer = instantiate(
-        settings,
-        _convert_="all",
-        max_epochs=max_epochs,
-        callbacks=callbacks,
-        logger=loggers or False,
-        use_distributed_sampler=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        default_root_dir=folder,
-        plugins=[AtomicCheckpointIO()],
-    )
-    return trainer
-
-
 def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
     path = folder.checkpoint(stage.module.stage)
-    keep_last = ModelCheckpoint(
-        dirpath=path.parent,
-        filename=path.stem,
-        every_n_epochs=config.checkpoint_every,
-        save_on_train_epoch_end=True,
-        enable_version_counter=False,
-    )
-    trainer = make_trainer(
-        config,
-        max_epochs=stage.module.n_epochs,
-        callbacks=[*stage.callbacks, keep_last],
-        loggers=loggers,
-        folder=path.parent,
-    )
+    trainer = trainer_of(stage, config, folder, loggers)
     resume_from = None
     if path.exists():
-        check_fits(stage.module, read_checkpoint(path)["state_dict"], path)
+        check_checkpoint(stage.module, path)
         resume_from = path
         log.info("Going on from %s", path)
-    trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
-    if trainer.current_epoch < stage.module.n_epochs and not config.trainer.fast_dev_run:
-        raise UserError(
-            f"{stage.module.stage} stopped after {trainer.current_epoch} of {stage.module.n_epochs} passes, by a "
-            "limit of the trainer or a callback: its weights are not recorded as trained. Give it fewer passes "
-            f"({stage.module.stage}.iterations), or lift the limit and go on with "
-            f"{as_typed('memcomp-train', f'resume={short_path(folder.path)}')}, from the last checkpoint "
-            f"(checkpoint_every={config.checkpoint_every})."
-        )
+    try:
+        trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
+    except (NotTrainedError, TrainingSpikeException) as error:
+        raise UserError(f"{stage.module.progress}: {error}") from error
+    except MisconfigurationException as error:
+        raise UserError(f"{stage.module.stage}: {explain(error)}") from error
+    except RuntimeError as error:
+        if not str(error).startswith("Early stopping conditioned on metric"):
+            raise
+        raise UserError(f"callbacks.{stage.module.stage}: {error}") from error
+    _check_trained(stage, config)
     return trainer
+
+
+def _check_trained(stage: Stage, config: DictConfig) -> None:
+    """Whatever stopped the stage, each of its models has been trained."""
+    passes, module = stage.module.passes, stage.module
+    n_models = len(module.models) if isinstance(module, EnergyPretraining) else 1
+    if not config.trainer.fast_dev_run and (len(passes) < n_models or min(passes) == 0):
+        raise UserError(
+            f"{module.stage} ended after {' and '.join(map(str, passes))} passes, before all of its "
+            f"{n_models} models were trained: its weights are not recorded. Leave out the callback that ended it."
+        )
 
 
 def _trained(stage: Stage) -> torch.nn.Module:
@@ -184,7 +140,11 @@ def _trained(stage: Stage) -> torch.nn.Module:
 
 def _record(stage: Stage) -> dict[str, Any]:
     module = stage.module
-    record: dict[str, Any] = {"iterations": module.iterations, "wall_time_s": module.wall_time_s}
+    record: dict[str, Any] = {
+        "iterations": module.iterations,
+        "passes": module.passes,
+        "wall_time_s": module.wall_time_s,
+    }
     if isinstance(module, EnergyPretraining):
         record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
         record["trained"] = module.model_names
@@ -218,7 +178,7 @@ def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]
     for layer, gaps in enumerate(result["stages"].get("pretrain", {}).get("energy_gap", []), start=1):
         metrics[f"final/energy_gap_layer{layer}"] = sum(gaps) / len(gaps)
     for layer, value in enumerate(final_log_likelihoods(result), start=1):
-        if value:  # no callback measured it
+        if value:  # none where nothing measures it
             metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
     metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
     write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)

@@ -54,11 +54,13 @@ def run_table(result: dict[str, Any]) -> str:
     likelihoods = final_log_likelihoods(result)
     for name, record in result["stages"].items():
         gaps = record.get("energy_gap", [])
-        for layer, (trained, gap) in enumerate(zip(record.get("trained", []), gaps, strict=False)):
+        passes = [_passes(n, record["iterations"]) for n in record.get("passes", [])]
+        passes = passes or [str(record["iterations"])] * max(1, len(gaps))
+        for layer, (trained, n, gap) in enumerate(zip(record.get("trained", []), passes, gaps, strict=False)):
             nats = with_error(likelihoods[layer], digits=2) if likelihoods[layer] else ""
-            rows.append([f"{name} {trained}", str(record["iterations"]), with_error(gap), nats, "", ""])
+            rows.append([f"{name} {trained}", n, with_error(gap), nats, "", ""])
         if not gaps:
-            rows.append([name, str(record["iterations"]), "", "", with_error(result["test_accuracy"]), ""])
+            rows.append([name, passes[0], "", "", with_error(result["test_accuracy"]), ""])
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"
     context = result.get("context", {})
     if (independent := context.get("independent_units")) is not None:
@@ -77,6 +79,11 @@ def without_empty_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     """The rows without the columns that hold nothing below their title."""
     filled = [any(row[column] for row in rows[1:]) for column in range(len(rows[0]))]
     return [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
+
+
+def _passes(n: int, iterations: int) -> str:
+    """Passes done, and how many were asked for where something ended the stage before."""
+    return str(n) if n == iterations else f"{n} of {iterations}"
 
 
 def closing_lines(folder: Path) -> str:

@@ -38,7 +38,7 @@ class Digits(GreySource):
         v = without_corners(torch.from_numpy(digits.images)[:, 1:-1, 1:-1].float() / 16)
         label = torch.from_numpy(digits.target).long()
         train, test = train_test_split(
-            torch.arange(len(label)).numpy(),
+            torch.arange(len(label), device="cpu").numpy(),
             test_size=0.2,
             stratify=label.numpy(),
             random_state=self.split_seed,

@@ -71,7 +71,7 @@ class ImageDataModule(LightningDataModule):
         # Without parts and without a held-out set there is nothing to deal, and no copy of the images.
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
-            order = torch.randperm(len(images.train_label), generator=generator)
+            order = torch.randperm(len(images.train_label), generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
             self._train = self._take(order[..., : self.n_train])
             if n_held_out:

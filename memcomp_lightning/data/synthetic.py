@@ -40,7 +40,7 @@ class ShiftingBars:
 
     def load(self) -> ImageData:
         """Return the patterns."""
-        pixel = torch.arange(self.n_pixels)
+        pixel = torch.arange(self.n_pixels, device="cpu")
         offset = (pixel - pixel[:, None]) % self.n_pixels
         v = ((offset < self.bar_length) ^ self.inverted).float()
         layout, name = (
@@ -77,12 +77,13 @@ class BarsAndStripes:
     def load(self) -> ImageData:
         """Return the pictures, stripes first."""
         side = self.side
-        bits = (torch.arange(2**side)[:, None] >> torch.arange(side) & 1).float()
+        row = torch.arange(side, device="cpu")
+        bits = (torch.arange(2**side, device="cpu")[:, None] >> row & 1).float()
         stripes = bits[:, :, None].expand(-1, side, side)
         # The first and the last pattern of bits are the uniform pictures, which the stripes hold already.
         bars = bits[1:-1, None, :].expand(-1, side, side)
         v = torch.cat((stripes, bars)).flatten(1)
-        label = (torch.arange(len(v)) >= len(stripes)).long()
+        label = (torch.arange(len(v), device="cpu") >= len(stripes)).long()
         layout = PixelLayout(height=side, width=side)
         return _same_set(v, label, 2, layout, "bars_and_stripes", self.copies)
 

@@ -37,6 +37,7 @@ class Prepared(NamedTuple):
     closes: Array
 
 
+@np.errstate(all="ignore")
 def prepare(one: Layers, n_second: int) -> Prepared:
     """Sort the units of the other layer into packs, tabulate what depends on u."""
     weight, bias, other = (x.numpy() for x in one[:3])
@@ -65,6 +66,7 @@ def prepare(one: Layers, n_second: int) -> Prepared:
     )
 
 
+@np.errstate(all="ignore")
 def sum_compiled(prepared: Prepared, at: slice) -> Tensor:
     """Log of the summed weights of each prefix of a block."""
     shifts = np.arange(prepared.bias.size - 1, -1, -1)

@@ -184,25 +184,36 @@ def _log_shares(rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def log_pseudo_likelihood(
-    model: RBM, v: Float[Tensor, "*axes n n_visible"]
+    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"]
 ) -> Float[Tensor, "*replicas n n_visible"]:
     r"""Return log p(v_j | all other v) of each unit j of each image; needs no log Z.
 
     .. math:: log p(v_j | v_{-j}) = -softplus(F(v) - F(v'))
 
-    where v' is v with unit j flipped, whose hidden field differs from that of v by one column of W. (Besag 1975.)
+    where v' is v with unit j flipped. (Besag 1975.) In an RBM its hidden field differs from that of v by one
+    column of W; in a Boltzmann machine the hidden units, up to 16 outside their largest class, are enumerated.
 
     Args:
-        model: The RBM.
+        model: The model.
         v: Images in {0, 1}, as for :func:`log_likelihood`.
 
     Returns:
         ``(*replicas, n, n_visible)`` float64; the sum over the last axis is the log pseudo-likelihood of an image.
 
     Raises:
-        SettingError: v is not binary or has the wrong shape.
+        SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
+    if isinstance(model, BoltzmannMachine):
+        flips = torch.eye(model.n_visible, dtype=torch.float64, device=v.device)
+
+        def of_images(rows: Tensor) -> Tensor:
+            flipped = (rows.unsqueeze(-2) - flips).abs()
+            log_sums = log_hidden_sum(model, flipped.flatten(-3, -2), max_units=MOST_HIDDEN)
+            log_sum = log_hidden_sum(model, rows, max_units=MOST_HIDDEN).unsqueeze(-1)
+            return -softplus(log_sums.unflatten(-1, flipped.shape[-3:-1]) - log_sum)
+
+        return _in_chunks(of_images, v, model.n_visible * model.n_units)
     weight, b, c = _double(model)
 
     def of_rows(rows: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def prefix_log_weights(
     if block is None:
         block = max(1, (_COMPILED_PAIRS if cpu else _REFERENCE_PAIRS // min(together, n_replicas)) // pairs)
     blocks = list(product(_slices(n_replicas, together), _slices(n_prefixes, block)))
-    out = torch.empty(n_replicas, n_prefixes, dtype=torch.float64)
+    out = torch.empty(n_replicas, n_prefixes, dtype=torch.float64, device="cpu")
     if cpu:
         prepared = [cpu.prepare(layers.part(r), n_second) for r in range(n_replicas)]
         cpu.sum_compiled(prepared[0], slice(0, 0))  # compiles, which is no part of the estimate of the time

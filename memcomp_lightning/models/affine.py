@@ -5,7 +5,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.ambient import in_own_dtypes
 
+
+@in_own_dtypes
 def affine(
     x: Float[Tensor, "*replicas n n_in"],
     weight: Float[Tensor, "*replicas n_out n_in"],

@@ -1,13 +1,14 @@
 """The Boltzmann machine: visible and hidden units with any symmetric connectivity."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
+from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
@@ -64,7 +65,8 @@ class BoltzmannMachine(nn.Module):
     or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent units.
 
     Attributes:
-        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first.
+        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first; part of the state dict, so that
+            weights go into a machine of the same pairs alone.
         coupling: w, one number a pair, ``(*replicas, n_pairs)``.
         b: Visible bias, ``(*replicas, n_visible)``.
         c: Hidden bias, ``(*replicas, n_hidden)``.
@@ -90,6 +92,7 @@ class BoltzmannMachine(nn.Module):
     torch.Size([5])
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         n_visible: int,
@@ -120,17 +123,43 @@ class BoltzmannMachine(nn.Module):
         )
         generator = stream(0, "weights") if generator is None else generator
         self.pairs: Tensor
-        self.register_buffer("pairs", pairs, persistent=False)
+        self.register_buffer("pairs", pairs)
         draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
         self.coupling = nn.Parameter(draw)
-        self.b = nn.Parameter(torch.zeros(*replicas, n_visible))
-        self.c = nn.Parameter(torch.zeros(*replicas, n_hidden))
+        self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
+        self.c = nn.Parameter(draw.new_zeros(*replicas, n_hidden))
         classes = sorted(colouring(n_units, pairs), key=lambda units: -int((units < n_visible).sum()))
         self._n_forward: list[int] = []
         for number, layout in enumerate(_layouts(n_units, pairs, classes)):
             self._n_forward.append(layout.n_forward)
             for name in _INDICES:
                 self.register_buffer(f"_{name}{number}", getattr(layout, name), persistent=False)
+
+    def other_pairs(self, pairs: Tensor | None) -> str:
+        """Say what speaks against couplings of these pairs in this machine; empty if nothing does.
+
+        Args:
+            pairs: Those of a weight file; None if it has none, as files of version 0.1, which is understood where
+                the number of units says what they are.
+        """
+        if pairs is None:
+            known = len(self.pairs) == self.n_units * (self.n_units - 1) // 2
+            return "" if known else "the couplings are of unknown pairs, because the file does not hold them."
+        if self.pairs.equal(pairs.to(self.pairs)):
+            return ""
+        own, given = ({tuple(pair) for pair in some.tolist()} for some in (self.pairs, pairs))
+        only = min(given ^ own, default=())
+        where = "the file" if only in given else "this machine"
+        return f"the couplings are of other pairs of units: {only} is coupled in {where} alone."
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        """Refuse couplings of other pairs."""
+        name = f"{prefix}pairs"
+        *_, error_messages = arguments
+        if reason := self.other_pairs(state_dict.get(name)):
+            error_messages.append(reason)
+        state_dict[name] = self.pairs
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     def _initial(
         self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
@@ -210,6 +239,7 @@ class BoltzmannMachine(nn.Module):
         """Mean of E over configurations, by their weights."""
         return self.total_energy(configurations.v, configurations.h, shares(configurations))
 
+    @in_own_dtypes
     def total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],
@@ -223,6 +253,7 @@ class BoltzmannMachine(nn.Module):
         total: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
         return total
 
+    @in_own_dtypes
     def centred_total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],
@@ -318,9 +349,9 @@ def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | N
 
 
 def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Layout]:
-    colour, place = torch.empty(n_units, dtype=torch.long), torch.empty(n_units, dtype=torch.long)
+    colour, place = pairs.new_empty(n_units), pairs.new_empty(n_units)
     for number, units in enumerate(classes):
-        colour[units], place[units] = number, torch.arange(len(units))
+        colour[units], place[units] = number, torch.arange(len(units), device=pairs.device)
     found = []
     for number, units in enumerate(classes):
         ends, edges = [], []

@@ -14,6 +14,8 @@ from memcomp_lightning.errors import require, require_count
 Pairs = Int[Tensor, "n_pairs 2"]
 """Coupled units, each pair once, the lower index first, in ascending order."""
 
+_NONE = torch.empty(0, 2, dtype=torch.long)
+
 
 def full(n_units: int) -> Pairs:
     """Every pair.
@@ -22,7 +24,7 @@ def full(n_units: int) -> Pairs:
     [[0, 1], [0, 2], [1, 2]]
     """
     require_count("n_units", n_units)
-    return torch.combinations(torch.arange(n_units)) if n_units > 1 else torch.empty(0, 2, dtype=torch.long)
+    return torch.combinations(torch.arange(n_units, device="cpu")) if n_units > 1 else _NONE
 
 
 def layered(sizes: Sequence[int]) -> Pairs:
@@ -33,12 +35,9 @@ def layered(sizes: Sequence[int]) -> Pairs:
     """
     for size in sizes:
         require_count("size of a layer", size)
-    bounds = torch.tensor([0, *sizes]).cumsum(0).tolist()
-    layers = [torch.arange(start, stop) for start, stop in pairwise(bounds)]
-    return torch.cat(
-        [torch.cartesian_prod(lower, upper) for lower, upper in pairwise(layers)]
-        or [torch.empty(0, 2, dtype=torch.long)]
-    )
+    bounds = torch.tensor([0, *sizes], device="cpu").cumsum(0).tolist()
+    layers = [torch.arange(start, stop, device="cpu") for start, stop in pairwise(bounds)]
+    return torch.cat([torch.cartesian_prod(lower, upper) for lower, upper in pairwise(layers)] or [_NONE])
 
 
 def grid(n_rows: int, n_columns: int) -> Pairs:
@@ -49,7 +48,7 @@ def grid(n_rows: int, n_columns: int) -> Pairs:
     """
     require_count("n_rows", n_rows)
     require_count("n_columns", n_columns)
-    at = torch.arange(n_rows * n_columns).view(n_rows, n_columns)
+    at = torch.arange(n_rows * n_columns, device="cpu").view(n_rows, n_columns)
     right = torch.stack((at[:, :-1], at[:, 1:]), dim=-1).view(-1, 2)
     down = torch.stack((at[:-1], at[1:]), dim=-1).view(-1, 2)
     return from_pairs(at.numel(), torch.cat((right, down)))
@@ -63,7 +62,7 @@ def from_graph(graph: Any) -> Pairs:
     """
     number = {node: index for index, node in enumerate(sorted(graph.nodes))}
     edges = [(number[first], number[second]) for first, second in graph.edges]
-    return from_pairs(len(number), torch.tensor(edges, dtype=torch.long).view(-1, 2))
+    return from_pairs(len(number), torch.tensor(edges, dtype=torch.long, device="cpu").view(-1, 2))
 
 
 def from_mask(mask: Tensor) -> Pairs:
@@ -96,7 +95,7 @@ def from_pairs(n_units: int, pairs: Int[Tensor, "n_pairs 2"] | Iterable[tuple[in
         SettingError: A unit that does not exist, a pair given twice (in either order), a unit with itself.
     """
     require_count("n_units", n_units)
-    given = torch.as_tensor(pairs if isinstance(pairs, Tensor) else list(pairs), dtype=torch.long)
+    given = torch.as_tensor(pairs if isinstance(pairs, Tensor) else list(pairs), dtype=torch.long, device="cpu")
     require(given.numel() == 0 or (given.ndim == 2 and given.shape[1] == 2), "pairs", tuple(given.shape), "(n, 2)")
     given = given.view(-1, 2)
     outside = given[(given < 0) | (given >= n_units)][:1].tolist()
@@ -125,7 +124,7 @@ def colouring(n_units: int, pairs: Pairs) -> list[Int[Tensor, " n_class"]]:
         neighbours[second].append(first)
     by_degree = sorted(range(n_units), key=lambda unit: -len(neighbours[unit]))
     found = min((_greedy(neighbours, order) for order in (_outwards(neighbours), by_degree)), key=max)
-    colours = torch.tensor(found)
+    colours = torch.tensor(found, device="cpu")
     return [(colours == colour).nonzero().flatten() for colour in range(max(found) + 1)]
 
 

@@ -60,6 +60,10 @@ class DBM(BoltzmannMachine):
         drawn = [init((*replicas, n_out, n_in), generator=generator) for n_in, n_out in pairwise(self.sizes)]
         return _flat(drawn)
 
+    def other_pairs(self, pairs: Tensor | None) -> str:
+        """As in any machine; files without pairs are taken to be of the same layers."""
+        return "" if pairs is None else super().other_pairs(pairs)
+
     def weights(self) -> list[Float[Tensor, "*replicas n_out n_in"]]:
         """The couplings of each layer to the one below, as copies."""
         parts = self.coupling.split([n_in * n_out for n_in, n_out in pairwise(self.sizes)], dim=-1)

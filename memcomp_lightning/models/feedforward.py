@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +27,7 @@ class Linear(nn.Module):
         generator: Random stream of the weights; None is a fresh stream of seed 0.
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         n_in: int,
@@ -40,8 +42,9 @@ class Linear(nn.Module):
         require_count("n_out", n_out)
         initialiser = Gaussian(std=0.01) if weight_init is None else weight_init
         generator = stream(0, "weights") if generator is None else generator
-        self.weight = nn.Parameter(initialiser((*replicas, n_out, n_in), generator=generator))
-        self.bias = nn.Parameter(torch.zeros(*replicas, n_out))
+        weight = initialiser((*replicas, n_out, n_in), generator=generator)
+        self.weight = nn.Parameter(weight)
+        self.bias = nn.Parameter(weight.new_zeros(*replicas, n_out))
 
     def forward(self, x: Float[Tensor, "*replicas n n_in"]) -> Float[Tensor, "*replicas n n_out"]:
         """Return ``x W^T + bias``."""
@@ -61,6 +64,7 @@ class BatchNorm(nn.Module):
     running_mean: Tensor
     running_var: Tensor
 
+    @torch.inference_mode(False)
     def __init__(
         self, n_features: int, *, replicas: tuple[int, ...] = (), momentum: float = 0.1, eps: float = 1e-5
     ) -> None:
@@ -68,10 +72,11 @@ class BatchNorm(nn.Module):
         require_count("n_features", n_features)
         self.momentum = momentum
         self.eps = eps
-        self.weight = nn.Parameter(torch.ones(*replicas, n_features))
-        self.bias = nn.Parameter(torch.zeros(*replicas, n_features))
-        self.register_buffer("running_mean", torch.zeros(*replicas, n_features))
-        self.register_buffer("running_var", torch.ones(*replicas, n_features))
+        plain: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+        self.weight = nn.Parameter(torch.ones(*replicas, n_features, **plain))
+        self.bias = nn.Parameter(torch.zeros(*replicas, n_features, **plain))
+        self.register_buffer("running_mean", torch.zeros(*replicas, n_features, **plain))
+        self.register_buffer("running_var", torch.ones(*replicas, n_features, **plain))
 
     def forward(self, x: Float[Tensor, "*replicas n n_features"]) -> Float[Tensor, "*replicas n n_features"]:
         """Normalise over the images of each replica.

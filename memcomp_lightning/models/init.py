@@ -30,7 +30,7 @@ class Gaussian:
 
     def __call__(self, shape: tuple[int, ...], *, generator: Generator) -> Tensor:
         """Return a tensor of this shape, drawn from ``generator``."""
-        return torch.empty(shape).normal_(0.0, self.std, generator=generator)
+        return _empty(shape, generator).normal_(0.0, self.std, generator=generator)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,7 +45,7 @@ class Uniform:
 
     def __call__(self, shape: tuple[int, ...], *, generator: Generator) -> Tensor:
         """Return a tensor of this shape, drawn from ``generator``."""
-        return torch.empty(shape).uniform_(self.low, self.high, generator=generator)
+        return _empty(shape, generator).uniform_(self.low, self.high, generator=generator)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,7 +60,7 @@ class Xavier:
     def __call__(self, shape: tuple[int, ...], *, generator: Generator) -> Tensor:
         """Return a tensor of this shape, drawn from ``generator``."""
         bound = self.gain * math.sqrt(6.0 / (shape[-1] + shape[-2]))
-        return torch.empty(shape).uniform_(-bound, bound, generator=generator)
+        return _empty(shape, generator).uniform_(-bound, bound, generator=generator)
 
 
 def mean_log_odds(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_visible"]:
@@ -90,3 +90,8 @@ def start_at_means(model: HasVisibleBias, v: Float[Tensor, "*axes n n_visible"])
         v: Training data, ``(*replicas, n, n_visible)``, or without replica axes for the same data everywhere.
     """
     model.b.copy_(mean_log_odds(v).expand(model.b.shape))
+
+
+def _empty(shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Single precision, on the device of the stream, whatever torch's defaults are."""
+    return torch.empty(shape, dtype=torch.float32, device=generator.device)

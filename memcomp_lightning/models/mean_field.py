@@ -30,9 +30,9 @@ class MeanFieldSolution(NamedTuple):
 
     Attributes:
         h: ``(*replicas, n, n_free)`` in (0, 1).
-        change: Largest change of a mean in the last iteration, ``(*replicas,)``.
+        change: Largest change of a mean in the last iteration of its configuration, ``(*replicas,)``.
         converged: Whether it is below the tolerance, ``(*replicas,)``.
-        n_iterations: Iterations done.
+        n_iterations: Iterations done, those of the configuration that took longest.
     """
 
     h: Tensor
@@ -54,8 +54,9 @@ def mean_field(
 
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
     p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration
-    is exact if no two free units are coupled. It stops when no mean changes by more than the tolerance, or says
-    that it did not converge.
+    is exact if no two free units are coupled. Each configuration stops when none of its means changes by more than
+    the tolerance, whatever the others do: its means do not depend on what it is batched with. Or it says that it
+    did not converge.
 
     Args:
         model: The machine.
@@ -71,18 +72,26 @@ def mean_field(
     x = torch.cat((given, unknown) if clamped == "visible" else (unknown, given), dim=-1)
     blocks = hidden_blocks(model) if clamped == "visible" else visible_blocks(model)
     coupled = any(bool(_among(block.neighbours, n_visible, clamped).any()) for block in blocks)
-    change = given.new_zeros(given.shape[:-2])
-    n_iterations = 0
-    for n_iterations in range(1, (max_iterations if coupled else 1) + 1):  # noqa: B007
-        change = torch.zeros_like(change)
+    if not coupled:
         for block in blocks:
-            mean = torch.sigmoid(block.field(x))
-            if coupled:
-                change = torch.maximum(change, (mean - x[..., block.units]).abs().amax((-2, -1)))
+            x[..., block.units] = torch.sigmoid(block.field(x))
+        change = given.new_zeros(given.shape[:-2])
+        return MeanFieldSolution(x[..., free], change, change < tolerance, 1)
+    change = given.new_full(given.shape[:-1], torch.inf)
+    n_iterations = 0
+    for n_iterations in range(1, max_iterations + 1):  # noqa: B007
+        moves = change >= tolerance
+        now = torch.zeros_like(change)
+        for block in blocks:
+            old = x[..., block.units]
+            mean = torch.where(moves.unsqueeze(-1), torch.sigmoid(block.field(x)), old)
+            now = torch.maximum(now, (mean - old).abs().amax(-1))
             x[..., block.units] = mean
-        if bool((change < tolerance).all()):
+        change = torch.where(moves, now, change)
+        if not bool((change >= tolerance).any()):
             break
-    return MeanFieldSolution(x[..., free], change, change < tolerance, n_iterations)
+    largest = change.amax(-1)
+    return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations)
 
 
 def hidden_blocks(model: ClassedModel) -> list[Any]:

@@ -39,7 +39,11 @@ class GaussianMoments:
     def __call__(self, dbn: DBN, *, generator: Generator) -> None:
         """Change each layer of each replica on its own."""
         for values in _vectors(dbn):
-            draw = torch.empty(values.shape, dtype=values.dtype).normal_(generator=generator).to(values.device)
+            draw = (
+                torch.empty(values.shape, dtype=values.dtype, device=generator.device)
+                .normal_(generator=generator)
+                .to(values.device)
+            )
             values.copy_(values.mean(-1, keepdim=True) + values.std(-1, correction=0, keepdim=True) * draw)
 
 

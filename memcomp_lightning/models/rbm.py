@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
+from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.init import Gaussian, Initialiser
@@ -39,6 +40,7 @@ class RBM(nn.Module):
     torch.Size([5])
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         n_visible: int,
@@ -53,9 +55,10 @@ class RBM(nn.Module):
         require_count("n_hidden", n_hidden)
         initialiser = Gaussian(std=0.01) if weight_init is None else weight_init
         generator = stream(0, "weights") if generator is None else generator
-        self.weight = nn.Parameter(initialiser((*replicas, n_hidden, n_visible), generator=generator))
-        self.b = nn.Parameter(torch.zeros(*replicas, n_visible))
-        self.c = nn.Parameter(torch.zeros(*replicas, n_hidden))
+        weight = initialiser((*replicas, n_hidden, n_visible), generator=generator)
+        self.weight = nn.Parameter(weight)
+        self.b = nn.Parameter(weight.new_zeros(*replicas, n_visible))
+        self.c = nn.Parameter(weight.new_zeros(*replicas, n_hidden))
 
     @property
     def n_visible(self) -> int:
@@ -83,6 +86,7 @@ class RBM(nn.Module):
         """Mean of E over configurations, by their weights."""
         return self.total_energy(configurations.v, configurations.h, shares(configurations))
 
+    @in_own_dtypes
     def total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],
@@ -102,6 +106,7 @@ class RBM(nn.Module):
         biases: Tensor = vecdot(self.b, sum_v) + vecdot(self.c, sum_h)
         return -(coupled + biases)
 
+    @in_own_dtypes
     def centred_total_energy(
         self,
         v: Float[Tensor, "*replicas n n_visible"],

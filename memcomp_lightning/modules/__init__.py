@@ -7,7 +7,7 @@ from memcomp_lightning.modules.finetuning import DBNClassifier
 from memcomp_lightning.modules.joint import BoltzmannPretraining, DBMPretraining, joined
 from memcomp_lightning.modules.losses import LOSSES, Loss, cross_entropy, squared_error
 from memcomp_lightning.modules.pretraining import DBNPretraining
-from memcomp_lightning.modules.stage import DivergedError, OptimizerFactory, StageModule
+from memcomp_lightning.modules.stage import DivergedError, NotTrainedError, OptimizerFactory, StageModule
 from memcomp_lightning.modules.weights import CheckpointError, load_weights, save_weights
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "DivergedError",
     "EnergyPretraining",
     "Loss",
+    "NotTrainedError",
     "OptimizerFactory",
     "Score",
     "StageModule",

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.losses import LOSSES, Loss, cross_entropy
 from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
@@ -34,7 +35,7 @@ class Score(NamedTuple):
     @property
     def accuracy(self) -> Tensor:
         """Share of images classified correctly, ``(*replicas,)`` in [0, 1]."""
-        return self.n_correct / self.n_images
+        return self.n_correct.float() / self.n_images
 
     @property
     def mean_loss(self) -> Tensor:
@@ -99,13 +100,14 @@ class Classifier(StageModule):
         """One optimiser for all parameters."""
         return self.make_optimizer(self.network.parameters())
 
+    @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Follow the gradient of the mean loss; replicas add up and stay independent.
 
         Returns:
             ``loss`` (scalar) and ``score``.
         """
-        sums = score(self(batch.v), batch.label, self.loss)
+        sums = score(self(plain(batch.v)), plain(batch.label), self.loss)
         loss = batch.share * sums.mean_loss.sum()
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": Score(sums.loss.detach(), sums.n_correct, sums.n_images)}

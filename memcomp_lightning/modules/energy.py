@@ -1,7 +1,10 @@
 """What the pretraining of any energy model shares: both phases, the contrast, the sampler's state."""
 
+import math
+import sys
 from abc import abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, cast
 
 import torch
@@ -9,6 +12,7 @@ from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
 from memcomp_lightning.objective import Centring, Offsets, contrast
@@ -19,6 +23,9 @@ from memcomp_lightning.types import Batch, Configurations, NegativePhase
 
 class EnergyPretraining(StageModule):
     """Follow the gradient of the contrast of both phases, for one energy model after the other.
+
+    A wish to stop ends the training of the model at hand, and the next one begins. An ``EarlyStopping`` starts
+    afresh with each model, and one that monitors a value of one layer means the same value of each.
 
     Args:
         sampler: Supplies the negative phase.
@@ -53,6 +60,8 @@ class EnergyPretraining(StageModule):
         self._offsets: Offsets | None = None
         self._negative: NegativePhase[Any] | None = None
         self._gap: Tensor | float = 0.0
+        self._begun_at = [0]
+        self._fewest_passes = 0
 
     @property
     @abstractmethod
@@ -80,24 +89,86 @@ class EnergyPretraining(StageModule):
     @property
     def layer(self) -> int:
         """Index of the model in training, 0 being the first."""
-        return min(self.current_epoch // self.iterations, len(self.models) - 1)
+        return len(self._begun_at) - 1 + self._next_is_due
 
     @property
     def iteration(self) -> int:
         """Passes done over the training set for this model."""
-        return self.current_epoch - self.layer * self.iterations
+        return 0 if self._next_is_due else self.current_epoch - self._begun_at[-1]
+
+    @property
+    def passes(self) -> list[int]:
+        """Passes done for each model begun."""
+        return [stop - start for start, stop in pairwise([*self._begun_at, self.current_epoch])]
+
+    @property
+    def _next_is_due(self) -> bool:
+        """Whether the model begun last has had its passes, and there is another one."""
+        n_passes = self.current_epoch - self._begun_at[-1]
+        if len(self._begun_at) == len(self.models) or n_passes <= 0:
+            return False
+        stopped = self.current_epoch == self._passes_done and self.trainer.should_stop
+        return n_passes >= self.iterations or (stopped and n_passes >= self._fewest_passes)
 
     @property
     def rbm(self) -> Any:
         """The model in training."""
         return self.models[self.layer]
 
+    def setup(self, stage: str) -> None:
+        """Begin with the first model."""
+        super().setup(stage)
+        if stage == "fit":
+            self._begun_at, self.energy_gaps = [0], []
+
+    def on_train_start(self) -> None:
+        """Take back the state of a checkpoint."""
+        fewest = self.trainer.min_epochs or 0
+        self._fewest_passes = 0 if fewest == sys.maxsize else fewest
+        super().on_train_start()
+        self._let_stop()
+
     def on_train_epoch_start(self) -> None:
-        """A new model starts without chains."""
+        """A new model starts without chains, and nothing has asked to stop its training."""
+        if self._next_is_due:
+            # The trainer would end the stage otherwise.
+            self.trainer.should_stop = False
+            self._begun_at.append(self.current_epoch)
         if self.iteration == 0:
             self._sampler_state, self._offsets = None, None
-            self.energy_gaps = [*self.energy_gaps, torch.zeros(self.rbm.replicas)]
+            self.energy_gaps = [
+                *self.energy_gaps,
+                torch.zeros(self.rbm.replicas, dtype=torch.float32, device="cpu"),
+            ]
+            for callback in self.trainer.early_stopping_callbacks:
+                callback.wait_count, callback.stopped_epoch = 0, 0
+                callback.best_score = torch.tensor(math.inf if callback.mode == "min" else -math.inf, device="cpu")
+                callback.monitor = self.monitored(callback.monitor)
 
+    def on_train_epoch_end(self) -> None:
+        """The stage may end with the last model alone."""
+        super().on_train_epoch_end()
+        self._let_stop()
+        planned = (len(self.models) - 1) * self.iterations
+        is_last = len(self._begun_at) == len(self.models)
+        if is_last and self._begun_at[-1] < planned and self.iteration + 1 == self.iterations:
+            self.trainer.should_stop = True  # the trainer does not know that earlier models had fewer passes
+
+    def on_train_end(self) -> None:
+        """Give the trainer its own setting back."""
+        super().on_train_end()
+        self.trainer.fit_loop.min_epochs = self._fewest_passes
+
+    def _let_stop(self) -> None:
+        """Tell the trainer from which pass on it may stop."""
+        is_last = len(self._begun_at) == len(self.models)
+        self.trainer.fit_loop.min_epochs = self._begun_at[-1] + self._fewest_passes if is_last else sys.maxsize
+
+    def monitored(self, name: str) -> str:
+        """The name under which a value that somebody monitors is logged for the model in training."""
+        return name
+
+    @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """Follow the gradient of the contrast of both phases.
 
@@ -154,7 +225,7 @@ class EnergyPretraining(StageModule):
         return negative
 
     def _mean_over_processes(self, value: Tensor | float) -> Tensor:
-        value = torch.as_tensor(value)
+        value = torch.as_tensor(value, dtype=torch.float32) if isinstance(value, float) else value
         if self.trainer.world_size == 1:
             return value
         return cast(Tensor, self.trainer.strategy.reduce(value, reduce_op="mean"))
@@ -163,11 +234,28 @@ class EnergyPretraining(StageModule):
         """The sampler's chains, the offsets and the energy gaps."""
         chains = None if self._sampler_state is None else tensors_of(self._sampler_state)
         offsets = None if self._offsets is None else self._offsets._asdict()
-        state = {"sampler": chains, "offsets": offsets, "energy_gaps": list(self.energy_gaps)}
+        state = {
+            "sampler": chains,
+            "offsets": offsets,
+            "energy_gaps": list(self.energy_gaps),
+            "begun_at": list(self._begun_at),
+        }
         return cast(dict[str, Any], move_data_to_device(state, "cpu"))
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Let callbacks find their state under the names of the model that was in training."""
+        super().on_load_checkpoint(checkpoint)
+        self._take_begun_at(checkpoint["process_states"][0]["extra"])
+        for callback in self.trainer.early_stopping_callbacks:
+            callback.monitor = self.monitored(callback.monitor)
+
+    def _take_begun_at(self, state: dict[str, Any]) -> None:
+        first_passes = [self.iterations * number for number in range(len(state["energy_gaps"]))]
+        self._begun_at = list(state.get("begun_at", first_passes or [0]))
 
     def take_extra_state(self, state: dict[str, Any]) -> None:
         """Take back the sampler's chains, the offsets and the energy gaps."""
+        self._take_begun_at(state)
         self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
         if state.get("offsets") is not None:
             self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})

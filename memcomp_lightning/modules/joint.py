@@ -101,6 +101,15 @@ class DBMPretraining(BoltzmannPretraining):
 
     def on_train_epoch_end(self) -> None:
         """Hand the weights to the DBN."""
+        super().on_train_epoch_end()
+        self._give()
+
+    def on_train_end(self) -> None:
+        """The same for weights that a callback put in their place."""
+        super().on_train_end()
+        self._give()
+
+    def _give(self) -> None:
         assert isinstance(self.model, DBM)
         self.model.give(self.dbn)
 

@@ -1,5 +1,6 @@
 """Greedy pretraining of a deep belief network, one RBM after the other."""
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -20,9 +21,9 @@ from memcomp_lightning.types import Batch
 class DBNPretraining(EnergyPretraining):
     """Train each RBM of a DBN on the mean activations of the layers below it.
 
-    One epoch is one *iteration*, a pass over the training set; the layer is
-    ``current_epoch // iterations``. Activations below the trained layer are computed chunk by chunk and
-    never held for the whole data set. Each layer has an optimiser of its own.
+    One epoch is one *iteration*, a pass over the training set; each layer has ``iterations`` of them, or fewer
+    where something stops its training. Activations below the trained layer are computed chunk by chunk and never
+    held for the whole data set. Each layer has an optimiser of its own.
 
     Args:
         dbn: The network; trained in place.
@@ -76,6 +77,10 @@ class DBNPretraining(EnergyPretraining):
     def active_optimizer(self) -> Optimizer:
         """The optimiser of the layer in training."""
         return self.trainer.optimizers[self.layer]
+
+    def monitored(self, name: str) -> str:
+        """The same value of the layer in training."""
+        return re.sub(rf"^{self.stage}/layer\d+/", f"{self.log_prefix}/", name)
 
     def images_of(self, v: Tensor) -> Tensor:
         """Inputs that the visible states of the layer in training stand for, for pictures."""

@@ -8,11 +8,13 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 import torch.distributed
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Generator, Tensor, nn
 from torch.nn import Parameter
 from torch.optim import SGD, Optimizer
 
 from memcomp_lightning import rng
+from memcomp_lightning.modules.trainers import check_trainer, tries
 
 OptimizerFactory = Callable[[Iterable[Parameter]], Optimizer]
 """Builds an optimiser for some parameters: ``functools.partial(torch.optim.SGD, lr=0.1)``."""
@@ -25,9 +27,15 @@ class DivergedError(ValueError):
     """Training left the finite numbers; which tensor, where, and what to do."""
 
 
+class NotTrainedError(ValueError):
+    """A stage ended, or a pass did, without the optimiser steps that belong to it."""
+
+
 def diverged_parameter(module: nn.Module, largest_allowed: float = LARGEST_WEIGHT) -> str | None:
     """Say which parameter left the allowed numbers, and how far; None if none did."""
     for name, parameter in module.named_parameters():
+        if not parameter.numel():  # biases of no hidden units
+            continue
         largest = float(parameter.detach().abs().max())
         if not largest <= largest_allowed:
             return f"{name} has an entry of {largest:g}"
@@ -40,6 +48,10 @@ PAPER_SGD: OptimizerFactory = partial(SGD, lr=0.1)
 
 class StageModule(pl.LightningModule):
     """A stage of training that steps its optimiser itself, once the last chunk of a batch is in.
+
+    Whatever asks to stop (``EarlyStopping``, a ``Timer``, ``max_time``, a callback of yours that sets
+    ``trainer.should_stop``) is heard at the end of the pass, so that no update is cut in two. The stage is then
+    done, after fewer passes.
 
     Checkpoints hold the random streams and the extra state of every process, as plain tensors: they load
     with ``weights_only=True``.
@@ -61,6 +73,9 @@ class StageModule(pl.LightningModule):
         self.seed = seed
         self.streams: dict[str, Generator] = {}
         self._loaded: list[dict[str, Any]] | None = None
+        self._passes_done = 0
+        self._stop_asked = False
+        self._mid_update = False
         self._seconds_before = 0.0
         self._started_at: float | None = None
 
@@ -73,6 +88,11 @@ class StageModule(pl.LightningModule):
     def iteration(self) -> int:
         """Passes done over the training set in this stage (of this layer, in pretraining)."""
         return self.current_epoch
+
+    @property
+    def passes(self) -> list[int]:
+        """Passes done, for each of the models that the stage trains one after the other."""
+        return [self.current_epoch]
 
     @property
     def log_prefix(self) -> str:
@@ -95,8 +115,20 @@ class StageModule(pl.LightningModule):
         """The optimiser that steps now."""
         return self.trainer.optimizers[0]
 
+    def configure_callbacks(self) -> list[pl.Callback]:
+        """Add none; check the trainer, before its callbacks set anything up.
+
+        Raises:
+            SettingError: The trainer has a setting or a callback that a stage does not go together with.
+        """
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            check_trainer(self.trainer)
+        return []
+
     def setup(self, stage: str) -> None:
         """Make this process's random streams."""
+        if stage == "fit":
+            self._passes_done, self._stop_asked, self._mid_update = 0, False, False
         self.streams = rng.streams(self.seed, self.stream_names, index=self.global_rank)
 
     def update(self, loss: Tensor, *, closes_step: bool, optimizer_index: int = 0) -> None:
@@ -109,6 +141,7 @@ class StageModule(pl.LightningModule):
                 parameter.grad = None
         else:
             self.manual_backward(loss)
+        self._mid_update = not closes_step
         if closes_step:
             optimizers = self.optimizers()
             optimizer = optimizers[optimizer_index] if isinstance(optimizers, list) else optimizers
@@ -124,6 +157,34 @@ class StageModule(pl.LightningModule):
                 f"{self.progress}: training diverged, {diverged}. Lower the learning rate "
                 f"({self.stage}.optimizer.lr) and start a new run."
             )
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Keep a wish to stop until the end of the pass."""
+        self._keep_wish()
+
+    def on_validation_end(self) -> None:
+        """Keep a wish to stop until the end of the pass."""
+        self._keep_wish()
+
+    def _keep_wish(self) -> None:
+        if self.trainer.should_stop and not self.trainer.sanity_checking:
+            self._stop_asked, self.trainer.should_stop = True, False
+
+    def on_train_epoch_end(self) -> None:
+        """Hand on a wish to stop.
+
+        Raises:
+            NotTrainedError: The pass ended in the middle of an update.
+        """
+        if self._mid_update and not tries(self.trainer):
+            raise NotTrainedError(
+                "the pass ended in the middle of an update, whose step was not taken. Something "
+                "left the last batches of the pass out: a callback, or a data loader of your own whose last batch "
+                "has closes_step = False."
+            )
+        self._passes_done = self.current_epoch + 1
+        if self._stop_asked:
+            self._stop_asked, self.trainer.should_stop = False, True
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Parameters that the present loss does not depend on."""
@@ -142,6 +203,8 @@ class StageModule(pl.LightningModule):
             "streams": rng.save(self.streams),
             "extra": self.extra_state(),
             "wall_time_s": self.wall_time_s,
+            "passes_done": self._passes_done,
+            "stop_asked": self._stop_asked or self.trainer.should_stop,
         }
         states: list[Any] = [own]
         if torch.distributed.is_available() and torch.distributed.is_initialized():
@@ -171,7 +234,24 @@ class StageModule(pl.LightningModule):
         rng.restore(self.streams, states[self.global_rank]["streams"])
         self.take_extra_state(states[self.global_rank]["extra"])
         self._seconds_before = states[self.global_rank]["wall_time_s"]
+        self._passes_done = states[self.global_rank].get("passes_done", self.current_epoch)
+        asked = states[self.global_rank].get("stop_asked", False)
+        at_the_end_of_a_pass = self._passes_done == self.current_epoch
+        self._stop_asked = asked and not at_the_end_of_a_pass
+        self.trainer.should_stop = asked and at_the_end_of_a_pass
 
     def on_train_end(self) -> None:
         """Stop the clock."""
         self._seconds_before, self._started_at = self.wall_time_s, None
+
+    def on_fit_end(self) -> None:
+        """Make sure that something was trained.
+
+        Raises:
+            NotTrainedError: No optimiser step was taken.
+        """
+        if self.trainer.global_step == 0 and not tries(self.trainer):
+            raise NotTrainedError(
+                "the stage ended without an optimiser step: its weights are those it began with. A limit of "
+                "the trainer (max_time, max_steps, max_epochs) or a callback stopped it before the first one."
+            )

@@ -5,9 +5,10 @@ from typing import Any
 
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import nn
+from torch import Tensor, nn
 
 from memcomp_lightning.files import written_whole
+from memcomp_lightning.models import BoltzmannMachine
 
 
 class CheckpointError(ValueError):
@@ -64,29 +65,76 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> None:
-    """Raise unless names and shapes are the module's.
+    """Raise unless a state dict is one of this module.
 
     Raises:
-        CheckpointError: Naming the first tensor that differs, both shapes, and what to do.
+        CheckpointError: Naming the first tensor that differs in name, shape or dtype or is not finite, or units
+            that are coupled otherwise, and what to do.
     """
     own = module.state_dict()
-    if missing := sorted(own.keys() - state_dict.keys()):
+    couplings = {
+        f"{name}.pairs".lstrip("."): m for name, m in module.named_modules() if isinstance(m, BoltzmannMachine)
+    }
+    if {"state_dict", "process_states"} <= state_dict.keys():
+        raise CheckpointError(
+            f"checkpoint {path} is one of a stage in training, not a weight file: use a file of the folder "
+            "weights, which each stage leaves when it is done."
+        )
+    if missing := sorted(own.keys() - state_dict.keys() - couplings.keys()):
         raise CheckpointError(f"checkpoint {path} has no tensor {missing[0]!r}: it is of another kind of model.")
     if unknown := sorted(state_dict.keys() - own.keys()):
         raise CheckpointError(f"checkpoint {path} has a tensor {unknown[0]!r} that this model does not have.")
+    for name in own.keys() & state_dict.keys():
+        found = state_dict[name]
+        if not isinstance(found, Tensor):
+            raise CheckpointError(f"checkpoint {path}: {name} is a {type(found).__name__}, expected a tensor.")
     for name, tensor in own.items():
-        if tuple(state_dict[name].shape) != tuple(tensor.shape):
+        if name in couplings:
+            if reason := couplings[name].other_pairs(state_dict.get(name)):
+                raise CheckpointError(f"checkpoint {path}: {reason} Use the model.connectivity it was made with.")
+            continue
+        found = state_dict[name]
+        if tuple(found.shape) != tuple(tensor.shape):
             raise CheckpointError(
-                f"checkpoint {path}: {name} has shape {tuple(state_dict[name].shape)}, this model needs "
+                f"checkpoint {path}: {name} has shape {tuple(found.shape)}, this model needs "
                 f"{tuple(tensor.shape)}. Use the model.hidden_sizes, data and data.partitions it was made with."
             )
+        if found.dtype != tensor.dtype and (
+            not found.is_floating_point() or torch.promote_types(found.dtype, tensor.dtype) != tensor.dtype
+        ):
+            raise CheckpointError(
+                f"checkpoint {path}: {name} is {_dtype(found)}, which {_dtype(tensor)}, the dtype of this model, "
+                "cannot hold. Use the trainer.precision it was made with."
+            )
+        if not bool(found.isfinite().all()):
+            raise CheckpointError(
+                f"checkpoint {path}: {name} has an entry that is NaN or infinite: it is of training that diverged."
+            )
+
+
+def check_checkpoint(module: nn.Module, path: Path) -> None:
+    """Raise unless a file is a checkpoint of a stage in training with this module.
+
+    Raises:
+        CheckpointError: As :func:`check_fits`, or the file is something else.
+    """
+    content = read_checkpoint(path)
+    if not {"state_dict", "process_states"} <= content.keys():
+        raise CheckpointError(
+            f"checkpoint {path} is no checkpoint of a stage in training: delete it to train the stage again."
+        )
+    check_fits(module, content["state_dict"], path)
+
+
+def _dtype(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
 
 
 def load_weights(module: nn.Module, path: Path) -> None:
     """Read a weight file into a module.
 
     Raises:
-        CheckpointError: The file cannot be read, or its names or shapes are not the module's.
+        CheckpointError: The file cannot be read, or does not fit: see :func:`check_fits`.
     """
     state_dict = read_checkpoint(path)
     check_fits(module, state_dict, path)

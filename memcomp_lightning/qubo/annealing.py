@@ -45,7 +45,8 @@ class GibbsAnnealing:
         shape = (*qubo.problems, self.n_restarts, qubo.n)
         x = (rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5).to(qubo.linear.dtype)
         blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
-        per_scale = torch.logspace(0, 1, self.n_sweeps, base=self.beta_last / self.beta_first, dtype=torch.float64)
+        growth = self.beta_last / self.beta_first
+        per_scale = torch.logspace(0, 1, self.n_sweeps, base=growth, dtype=torch.float64, device="cpu")
         for beta in (self.beta_first * per_scale).tolist():
             beta_here = (beta / scale).to(x.dtype)[..., None, None]
             for block in blocks:

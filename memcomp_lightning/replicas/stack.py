@@ -31,9 +31,13 @@ def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     states = [network.state_dict() for network in networks]
     shapes = [{name: tuple(x.shape) for name, x in state.items()} for state in states]
     require(all(shape == shapes[0] for shape in shapes), "networks", shapes, "networks of one shape")
-    # Buffers that are no state are indices, the same in all replicas.
     parameters = dict(whole.named_parameters())
     for name, tensor in states[0].items():
+        if not tensor.is_floating_point():  # indices of units, the same in all replicas
+            require(
+                all(tensor.equal(state[name]) for state in states), name, "different", "the same in all networks"
+            )
+            continue
         own_axes = tensor.shape[len(replicas) :]
         together = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
         owner, _, own_name = name.rpartition(".")

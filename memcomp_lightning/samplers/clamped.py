@@ -88,7 +88,8 @@ class ClampedGibbs:
         for _ in range(self.k):
             for block in blocks:
                 x[..., block.units] = rng.bernoulli(torch.sigmoid(block.field(x)), generator=generator)
-        x[..., blocks[-1].units] = torch.sigmoid(blocks[-1].field(x))
+        for last in blocks[-1:]:  # none in a machine without hidden units
+            x[..., last.units] = torch.sigmoid(last.field(x))
         return PositivePhase(Configurations(v, x[..., model.n_visible :]), {})
 
 

@@ -96,6 +96,6 @@ def _diagnostics(solution: QuboSolution) -> dict[str, Tensor]:
     return {
         "ground_state_energy": best,
         "restarts_run": n_run.double(),
-        "restarts_at_best": reached / n_run,
-        "solver_seconds": torch.tensor(solution.wall_time_s),
+        "restarts_at_best": reached.float() / n_run,
+        "solver_seconds": torch.tensor(solution.wall_time_s, dtype=torch.float32, device="cpu"),
     }

@@ -100,7 +100,7 @@ class ModeAssisted:
     def init(self, model: SizedModel, n_chains: int, *, generator: Generator) -> ModeAssistedState:
         """Start both samplers."""
         return ModeAssistedState(
-            torch.zeros((), dtype=torch.long),
+            torch.zeros((), dtype=torch.long, device="cpu"),
             self.inner.init(model, n_chains, generator=generator),
             self.mode.init(model, n_chains, generator=generator),
         )

@@ -83,14 +83,14 @@ class ParallelTempering:
         """Start all chains at random states and the gaps equal."""
         n, n_temperatures, replicas = self.n_chains or n_chains, self.n_temperatures, model.replicas
         x = chains_of(model).random(n_temperatures * n, generator=generator)
-        gap = torch.full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1)).to(x)
+        gap = x.new_full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1))
         return Ladder(
             x=x.unflatten(-2, (n_temperatures, n)),
             gap=gap,
             swap_rate=torch.full_like(gap, self.target_swap_rate),
-            last_end=torch.zeros((*replicas, n_temperatures, n), device=x.device),
-            round_trips=torch.zeros(replicas, device=x.device),
-            n_rounds=torch.zeros((), dtype=torch.long),
+            last_end=torch.zeros((*replicas, n_temperatures, n), dtype=torch.float32, device=x.device),
+            round_trips=torch.zeros(replicas, dtype=torch.float32, device=x.device),
+            n_rounds=torch.zeros((), dtype=torch.long, device="cpu"),
         )
 
     @torch.no_grad()

@@ -165,8 +165,9 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
         AssertionError: Naming what the solver got wrong.
     """
     name = type(solver).__name__
-    matrix = torch.empty(7, 7).normal_(generator=rng.stream(3, "matrix"))
-    batch = torch.empty(2, 3, 5, 5).normal_(generator=rng.stream(4, "matrix"))
+    plain: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+    matrix = torch.empty(7, 7, **plain).normal_(generator=rng.stream(3, "matrix"))
+    batch = torch.empty(2, 3, 5, 5, **plain).normal_(generator=rng.stream(4, "matrix"))
     problems = {
         "RBM": from_model(small_rbm()),
         "two axes of RBMs": from_model(small_rbm(replicas=(2, 3))),

@@ -628,5 +628,5 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
     kernel = SimpleNamespace(
         stats=SimpleNamespace(cache_path=str(tmp_path)), py_func=lanes.integrate_all.py_func, __name__="new"
     )
-    cpu._announce.__wrapped__(kernel)
+    cpu._forget_outdated.__wrapped__(kernel)
     assert {path.name for path in tmp_path.iterdir()} == {"lanes.gone.nbi", "lanes.new.nbi"}

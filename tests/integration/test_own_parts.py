@@ -96,13 +96,6 @@ def test_images_of_ones_own_from_the_page(
     assert "test accuracy" in outcome.out
 
 
-def test_a_limit_of_the_trainer_says_how_to_go_on(memcomp_train: Run) -> None:
-    outcome = memcomp_train("sampler=cd", *FAST, "+trainer.max_steps=1", "callbacks=minimal", "hydra.run.dir=run")
-    assert outcome.status == 2
-    assert "pretrain stopped after 1 of 4 passes" in outcome.err
-    assert "go on with resume=run, from the last checkpoint (checkpoint_every=10)." in outcome.err
-
-
 def test_a_missing_weight_file_is_trained_again_and_a_damaged_record_is_named(memcomp_train: Run) -> None:
     run = ["sampler=cd", *FAST, "callbacks=minimal", "hydra.run.dir=run"]
     assert memcomp_train(*run).status == 0

@@ -12,7 +12,6 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
@@ -28,6 +27,7 @@ from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_comm
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
+from memcomp_lightning.cli.trainers import check_trainers
 from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.modules import CheckpointError, DivergedError
 
@@ -84,12 +84,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     n_passes = config.finetune.iterations
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
-    try:
-        trainer = pipeline.make_trainer(config, max_epochs=1, callbacks=[], loggers=[], folder=Path())
-    except MisconfigurationException as error:
-        raise UserError(explain(error)) from error
-    for stage in plans[0].stages:
-        stage.data.train_batches(0, trainer.world_size)
+    check_trainers(plans[0], config)
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float | None:

@@ -140,7 +140,7 @@ def _run_lanes(
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     machine: Any = field.build(problem)
-    one = torch.ones(())
+    one = torch.ones((), dtype=torch.float32, device="cpu")
     scalars = (machine.pull_scale, one) if isinstance(machine, BondMachine) else (one, machine.degree)
     flat = [_array(x).reshape(-1) for x in (field.stability(machine), *scalars)]
     constants, control = _settings(field, integrator, *flat)

@@ -1,0 +1,54 @@
+"""What the caller's thread has switched on elsewhere, kept out of this package's numbers.
+
+Gradients that are off, inference mode and autocast belong to the code around a call. Models, their updates and
+their likelihoods are the same whatever they are: these helpers say so where it would not be true by itself. Dtypes
+and devices of new tensors are named where they are made, so that torch's defaults do not matter.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_KINDS = ("cpu", "cuda")
+
+
+@contextmanager
+def with_gradient() -> Iterator[None]:
+    """Record gradients, in the dtypes of the tensors, whatever is switched outside; also a decorator.
+
+    >>> with torch.inference_mode(), with_gradient():
+    ...     torch.is_grad_enabled()
+    True
+    """
+    with torch.inference_mode(False), torch.enable_grad(), _in_own_dtypes():
+        yield
+
+
+def plain(x: torch.Tensor) -> torch.Tensor:
+    """The tensor, or a copy of one that was made in inference mode, which no gradient could pass."""
+    return x.clone() if x.is_inference() else x
+
+
+def in_own_dtypes(function: Callable[P, T]) -> Callable[P, T]:
+    """Compute a function in the dtypes of its tensors, under ``torch.autocast``, too."""
+
+    @wraps(function)
+    def computed(*arguments: P.args, **settings: P.kwargs) -> T:
+        if not any(torch.is_autocast_enabled(kind) for kind in _KINDS):
+            return function(*arguments, **settings)
+        with _in_own_dtypes():
+            return function(*arguments, **settings)
+
+    return computed
+
+
+@contextmanager
+def _in_own_dtypes() -> Iterator[None]:
+    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        yield
