@@ -50,8 +50,12 @@ def restore(generators: dict[str, Generator], states: dict[str, Tensor]) -> None
 
 
 def uniform(shape: Iterable[int], *, generator: Generator, like: Tensor | None = None) -> Tensor:
-    """Draw from U[0, 1), on the generator's device, then moved to the device and dtype of ``like``."""
-    draw = torch.empty(tuple(shape), device=generator.device, dtype=None if like is None else like.dtype)
+    """Draw from U[0, 1), on the generator's device, then moved to the device of ``like``.
+
+    In the dtype of ``like``, else float32.
+    """
+    dtype = torch.float32 if like is None else like.dtype  # of torch's default dtype draws would depend
+    draw = torch.empty(tuple(shape), device=generator.device, dtype=dtype)
     draw.uniform_(generator=generator)
     return draw if like is None else draw.to(like.device)
 

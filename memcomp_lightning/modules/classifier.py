@@ -105,8 +105,11 @@ class Classifier(StageModule):
         Returns:
             ``loss`` (scalar) and ``score``.
         """
-        sums = score(self(batch.v), batch.label, self.loss)
-        loss = batch.share * sums.mean_loss.sum()
+        logits = self(batch.v)
+        sums, mean_loss = score(logits, batch.label, self.loss), None
+        if batch.weight is not None:
+            mean_loss = (self.loss(logits, batch.label) * batch.weight).sum(-1) / batch.weight.sum(-1)
+        loss = batch.share * (sums.mean_loss if mean_loss is None else mean_loss).sum()
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": Score(sums.loss.detach(), sums.n_correct, sums.n_images)}
 
