@@ -14,8 +14,8 @@ def with_gradients(device: torch.device | str = "cpu") -> Iterator[None]:
         device: Where the parameters are; autocast is switched off there.
     """
     kind = torch.device(device).type
-    has_autocast = torch.amp.is_autocast_available(kind)
-    autocast = torch.autocast(kind, enabled=False) if has_autocast else contextlib.nullcontext()
+    is_on = torch.amp.is_autocast_available(kind) and torch.is_autocast_enabled(kind)
+    autocast = torch.autocast(kind, enabled=False) if is_on else contextlib.nullcontext()
     with torch.inference_mode(False), torch.enable_grad(), autocast:
         yield
 
