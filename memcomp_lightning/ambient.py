@@ -6,7 +6,7 @@ and devices of new tensors are named where they are made, so that torch's defaul
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
@@ -51,4 +51,13 @@ def in_own_dtypes(function: Callable[P, T]) -> Callable[P, T]:
 @contextmanager
 def _in_own_dtypes() -> Iterator[None]:
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        yield
+
+
+@contextmanager
+def on_the_cpu() -> Iterator[None]:
+    """As :func:`with_gradient`, and what is made without a device is made on the CPU."""
+    # Where that is so already, the context would cost some microseconds in every operation.
+    elsewhere = torch.get_default_device().type != "cpu"
+    with with_gradient(), torch.device("cpu") if elsewhere else nullcontext():
         yield

@@ -100,3 +100,17 @@ def shares(configurations: Configurations) -> Tensor:
     if weight is None:
         return torch.full(v.shape[:-1], 1.0 / v.shape[-2], dtype=v.dtype, device=v.device)
     return weight / weight.sum(-1, keepdim=True)
+
+
+def weighted(positive: Configurations, weight: Tensor | None) -> Configurations:
+    """Let each image of a positive phase count so often.
+
+    Args:
+        positive: One or more configurations an image, those of one image side by side and of the same total
+            weight.
+        weight: Of the images, ``(*replicas, n_images)``; None changes nothing.
+    """
+    if weight is None:
+        return positive
+    of_rows = weight.repeat_interleave(positive.v.shape[-2] // weight.shape[-1], dim=-1)
+    return positive._replace(weight=of_rows if positive.weight is None else positive.weight * of_rows)

@@ -49,12 +49,14 @@ class Batch(NamedTuple):
         v: Intensities in [0, 1], ``(*replicas, n, n_visible)``.
         label: Class indices (int64), ``(*replicas, n)``.
         share: ``n_processes * n / n_step``, where ``n_step`` counts the images of the step over all its
-            chunks and processes. The gradient of ``share * mean over this batch``, summed over the chunks
-            and averaged over the processes, is the gradient of the mean over the step's images.
+            chunks and processes, each by its weight. The gradient of ``share * mean over this batch``, summed
+            over the chunks and averaged over the processes, is the gradient of the mean over the step's images.
         closes_step: Whether the optimiser steps after this chunk.
+        weight: How often each image counts, > 0, ``(*replicas, n)``; None means once.
     """
 
     v: Tensor
     label: Tensor
     share: float
     closes_step: bool
+    weight: Tensor | None = None

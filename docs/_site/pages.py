@@ -33,6 +33,7 @@ TITLES = {
     "solver_benchmark": "Solver benchmark",
     "dmm_study": "Parts of the DMM",
     "throughput": "Throughput",
+    "from_scikit_learn": "Beside scikit-learn",
 }
 MADE_BY_RUNS = {"results", "cache"}
 SHOWN = (".md", ".png", ".svg", ".csv", ".json")

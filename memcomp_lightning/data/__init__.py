@@ -8,7 +8,7 @@ from memcomp_lightning.data.baselines import independent_log_likelihood, logisti
 from memcomp_lightning.data.digits import Digits
 from memcomp_lightning.data.idx import CorruptFileError
 from memcomp_lightning.data.images import ImageData, ImageSource, PixelLayout
-from memcomp_lightning.data.loading import Batches
+from memcomp_lightning.data.loading import Batches, SparseRows
 from memcomp_lightning.data.mnist import Mnist, ReducedMnist
 from memcomp_lightning.data.module import ImageDataModule
 from memcomp_lightning.data.pixels import GreySource
@@ -29,6 +29,7 @@ __all__ = [
     "PixelLayout",
     "ReducedMnist",
     "ShiftingBars",
+    "SparseRows",
     "independent_log_likelihood",
     "logistic_regression",
     "reduce_images",

@@ -14,6 +14,46 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.types import Batch
 
 
+class SparseRows(NamedTuple):
+    """Images most of whose intensities are 0, as the rows of a matrix in CSR form; batches of them are dense.
+
+    Attributes:
+        start: Where each row begins in the two others, and where the last one ends (int64), ``(n + 1,)``.
+        unit: Visible unit of each value, ``(n_values,)`` int64.
+        value: Intensities in [0, 1], ``(n_values,)``.
+        n_visible: Visible units.
+
+    >>> rows = SparseRows(torch.tensor([0, 1, 3]), torch.tensor([2, 0, 1]), torch.tensor([0.5, 1.0, 1.0]), 3)
+    >>> rows.dense(torch.tensor([1, 0])).tolist()
+    [[1.0, 1.0, 0.0], [0.0, 0.0, 0.5]]
+    """
+
+    start: Tensor
+    unit: Tensor
+    value: Tensor
+    n_visible: int
+
+    @property
+    def shape(self) -> torch.Size:
+        """``(n, n_visible)``."""
+        return torch.Size((len(self.start) - 1, self.n_visible))
+
+    def to(self, device: torch.device | str) -> "SparseRows":
+        """Return the same rows on a device."""
+        return SparseRows(self.start.to(device), self.unit.to(device), self.value.to(device), self.n_visible)
+
+    def dense(self, index: Int[Tensor, " n_chunk"]) -> Tensor:
+        """Return some of the rows as a dense matrix, ``(n_chunk, n_visible)``."""
+        first = self.start[index]
+        counts = self.start[index + 1] - first
+        row = torch.arange(len(index), device=index.device).repeat_interleave(counts)
+        within = torch.arange(len(row), device=index.device) - (counts.cumsum(0) - counts)[row]
+        at = first[row] + within
+        dense = self.value.new_zeros(len(index), self.n_visible)
+        dense[row, self.unit[at]] = self.value[at]
+        return dense
+
+
 class Batches:
     """One pass over the images, as :class:`~memcomp_lightning.types.Batch` objects; an epoch each time.
 
@@ -26,7 +66,7 @@ class Batches:
     number of chunks in a step. No image is repeated or left out.
 
     Args:
-        v: Intensities, ``(*replicas, n, n_visible)``.
+        v: Intensities, ``(*replicas, n, n_visible)``; :class:`SparseRows` without replica axes.
         label: Class indices, ``(*replicas, n)``.
         batch_size: Images of a replica in an optimiser step, over all processes, >= 1; the last step of a
             pass takes what is left. None, or n and more, means all n.
@@ -35,6 +75,8 @@ class Batches:
         seed: Seed of the order.
         rank: Index of this process.
         world_size: Number of processes.
+        weight: How often each image counts in the mean over a step, > 0, ``(n,)``, without replica axes; None
+            means once each.
 
     Raises:
         SettingError: A setting is out of range, or a step leaves a process without images.
@@ -46,7 +88,7 @@ class Batches:
 
     def __init__(
         self,
-        v: Tensor,
+        v: Tensor | SparseRows,
         label: Tensor,
         batch_size: int | None,
         chunk_size: int,
@@ -54,8 +96,10 @@ class Batches:
         seed: int,
         rank: int = 0,
         world_size: int = 1,
+        weight: Tensor | None = None,
     ) -> None:
-        require(v.ndim >= 2 and v.numel() > 0, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
+        filled = len(v.shape) >= 2 and v.shape.numel() > 0
+        require(filled, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
         require(label.shape == v.shape[:-1], "label.shape", tuple(label.shape), f"{tuple(v.shape[:-1])}, as v")
         n = label.shape[-1]
         if batch_size is not None:
@@ -66,10 +110,18 @@ class Batches:
         require_count("rank", rank, minimum=0)
         require(rank < world_size, "rank", rank, f"an integer from 0 to {world_size - 1} (world_size - 1)")
         self._chunks = _plan(n, batch_size, chunk_size, rank, world_size)
+        if weight is not None:
+            fits = weight.shape == label.shape == (n,)
+            require(fits, "weight.shape", tuple(weight.shape), f"{(n,)}: a weight an image, without replica axes")
+            smallest = float(weight.min())
+            require(smallest > 0, "weight", smallest, "numbers > 0", "Leave out images that do not count.")
         # One chunk that is the whole pass: the order cannot matter, and the tensors go out uncopied.
         self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
         # Contiguous, the images of all replicas are the rows of one matrix.
-        self._v, self._label = (v.contiguous(), label.contiguous()) if self._shuffle else (v, label)
+        self._v, self._label, self._weight = v, label, weight
+        if self._shuffle:
+            self._v, self._label = v if isinstance(v, SparseRows) else v.contiguous(), label.contiguous()
+        self._world_size = world_size
         self._seeds: tuple[int, ...] = (seed,)
         self._replicas = tuple(label.shape[:-1])
         self._epoch = 0
@@ -83,6 +135,10 @@ class Batches:
             seeds: One for each repetition, at least one; equal seeds have the same order.
         """
         require(len(seeds) > 0, "seeds", list(seeds), "at least one seed")
+        if isinstance(self._v, SparseRows) or self._weight is not None:
+            raise ValueError(
+                "images in sparse rows, or with weights, have no replica axis: they are not repeated."
+            )
         repeated = copy.copy(self)
         repeated._seeds = tuple(seeds)
         repeated._replicas = (len(seeds) * math.prod(self._replicas),)
@@ -96,6 +152,7 @@ class Batches:
         """Return the same batches with all images on a device."""
         moved = copy.copy(self)
         moved._v, moved._label = self._v.to(device), self._label.to(device)
+        moved._weight = None if self._weight is None else self._weight.to(device)
         return moved
 
     @property
@@ -126,13 +183,9 @@ class Batches:
         resume, self._resume = self._resume, None
         start = resume["position"] % len(self) if resume and resume["epoch"] == self._epoch else 0
         order = self._order() if self._shuffle else None
-        for position, (positions, share, closes_step) in enumerate(self._chunks[start:], start + 1):
+        for position, chunk in enumerate(self._chunks[start:], start + 1):
             self._progress = {"epoch": self._epoch, "position": position}
-            if order is None:
-                v, label = self._v[..., positions, :], self._label[..., positions]
-            else:
-                v, label = self._gather(order[..., positions])
-            yield Batch(v, label, share, closes_step)
+            yield self._batch(chunk, order)
 
     def state_dict(self) -> dict[str, int]:
         """Return how far the current pass is; Lightning saves it with a checkpoint."""
@@ -146,12 +199,28 @@ class Batches:
         """
         self._resume = self._progress = dict(state)
 
-    def _gather(self, index: Int[Tensor, "*replicas n_chunk"]) -> tuple[Tensor, Tensor]:
+    def _batch(self, chunk: "_Chunk", order: Tensor | None) -> Batch:
+        v, label, positions = self._v, self._label, chunk.positions
+        if isinstance(v, SparseRows):
+            rows = torch.arange(len(label), device=label.device) if order is None else order
+            v, label = v.dense(rows[positions]), label[rows[positions]]
+        elif order is None:
+            v, label = v[..., positions, :], label[..., positions]
+        else:
+            v, label = self._gather(v, order[..., positions])
+        if self._weight is None:
+            return Batch(v, label, chunk.share, chunk.closes_step)
+        weights = self._weight if order is None else self._weight[order]
+        weight = weights[positions]
+        share = self._world_size * float(weight.sum()) / float(weights[chunk.step].sum())
+        return Batch(v, label, share, chunk.closes_step, weight)
+
+    def _gather(self, v: Tensor, index: Int[Tensor, "*replicas n_chunk"]) -> tuple[Tensor, Tensor]:
         # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
         # of torch.take_along_dim, which looks up each single value.
         flat = index.flatten()
-        v = self._v.flatten(0, -2).index_select(0, flat).view(*index.shape, -1)
-        return v, self._label.flatten().index_select(0, flat).view(index.shape)
+        gathered = v.flatten(0, -2).index_select(0, flat).view(*index.shape, -1)
+        return gathered, self._label.flatten().index_select(0, flat).view(index.shape)
 
     def _order(self) -> Int[Tensor, "*replicas n"]:
         """Return this epoch's order, as rows of all replicas' images laid end to end."""
@@ -160,13 +229,19 @@ class Batches:
         orders = {}
         for seed in dict.fromkeys(self._seeds):
             generator = rng.stream(seed, "data_order", self._epoch)
-            orders[seed] = torch.stack([torch.randperm(n, generator=generator) + first for first in first_rows])
+            # On the generator's device, whatever torch's default device is.
+            orders[seed] = torch.stack(
+                [torch.randperm(n, generator=generator, device="cpu") + first for first in first_rows]
+            )
         order = torch.cat([orders[seed] for seed in self._seeds])
-        return order.view(*self._replicas, n).to(self._v.device)
+        return order.view(*self._replicas, n).to(self._label.device)
 
 
 class _Chunk(NamedTuple):
+    """Positions in the order, of the chunk and of its whole step."""
+
     positions: slice
+    step: slice
     share: float
     closes_step: bool
 
@@ -183,7 +258,8 @@ def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size
         for k in range(n_chunks):
             part = shard[bounds[k] : bounds[k + 1]]
             positions = slice(part.start, part.stop, part.step)
-            plan.append(_Chunk(positions, world_size * len(part) / len(step), k == n_chunks - 1))
+            share = world_size * len(part) / len(step)
+            plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1))
     return plan
 
 

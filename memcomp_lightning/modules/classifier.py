@@ -107,8 +107,12 @@ class Classifier(StageModule):
         Returns:
             ``loss`` (scalar) and ``score``.
         """
-        sums = score(self(plain(batch.v)), plain(batch.label), self.loss)
-        loss = batch.share * sums.mean_loss.sum()
+        logits, label = self(plain(batch.v)), plain(batch.label)
+        sums = score(logits, label, self.loss)
+        mean_loss = sums.mean_loss
+        if batch.weight is not None:
+            mean_loss = (self.loss(logits, label) * batch.weight).sum(-1) / batch.weight.sum(-1)
+        loss = batch.share * mean_loss.sum()
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": Score(sums.loss.detach(), sums.n_correct, sums.n_images)}
 

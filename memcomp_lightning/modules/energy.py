@@ -15,7 +15,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
-from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.objective import Centring, Offsets, contrast, weighted
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
 from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.types import Batch, Configurations, NegativePhase
@@ -181,6 +181,7 @@ class EnergyPretraining(StageModule):
         with torch.no_grad():
             v = self.visible_of(batch)
             positive, inferred = self.infer(v)
+            positive = weighted(positive, batch.weight)
         if self._negative is None and self.centring is not None:
             offsets = self.centring.follow(self._offsets, positive)
             self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))

@@ -2,6 +2,8 @@
 
 from memcomp_lightning.replicas.stack import stacked
 from memcomp_lightning.replicas.training import (
+    Backpropagation,
+    ContrastTraining,
     Pass,
     Rates,
     finetune,
@@ -9,9 +11,12 @@ from memcomp_lightning.replicas.training import (
     pretrain_jointly,
     pretrain_layer,
     pretrain_machine,
+    require_finite,
 )
 
 __all__ = [
+    "Backpropagation",
+    "ContrastTraining",
     "Pass",
     "Rates",
     "finetune",
@@ -19,5 +24,6 @@ __all__ = [
     "pretrain_jointly",
     "pretrain_layer",
     "pretrain_machine",
+    "require_finite",
     "stacked",
 ]

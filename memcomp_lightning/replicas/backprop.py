@@ -109,7 +109,7 @@ def _in_closed_form(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], 
         norms.append(norm)
     top = layers[-1]
     logits = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1))
-    delta = of_logits(logits, batch.label).mul_(batch.share / batch.label.shape[-1]).mT
+    delta = of_logits(logits, batch.label).mul_(_share_of_each(batch)).mT
     for number in range(len(layers) - 1, -1, -1):
         layer = layers[number]
         if number < len(layers) - 1:
@@ -172,4 +172,13 @@ def _add(parameter: Parameter, gradient: Tensor) -> None:
 
 
 def _by_autograd(network: nn.Module, loss: Loss, batch: Batch) -> None:
-    (loss(network(batch.v), batch.label).sum() * (batch.share / batch.label.shape[-1])).backward()
+    share = _share_of_each(batch)
+    losses = loss(network(batch.v), batch.label)
+    (losses.sum() * share if isinstance(share, float) else (losses * share.squeeze(-2)).sum()).backward()
+
+
+def _share_of_each(batch: Batch) -> float | Tensor:
+    """What the loss of an image counts for in the step's mean: a number, or ``(*replicas, 1, n)``."""
+    if batch.weight is None:
+        return batch.share / batch.label.shape[-1]
+    return (batch.share * batch.weight / batch.weight.sum(-1, keepdim=True)).unsqueeze(-2)

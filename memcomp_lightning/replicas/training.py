@@ -6,7 +6,7 @@ another device chains are drawn there, from a stream of that device, and nothing
 they leave out looks at training, which costs more than an update of a small network.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -14,16 +14,18 @@ from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 
 from memcomp_lightning import rng
+from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.callbacks.learning_rate_decay import set_learning_rate
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, RBM, BoltzmannMachine
 from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy, joined
 from memcomp_lightning.modules.stage import diverged_parameter
-from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.objective import Centring, Offsets, contrast, weighted
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhaseSampler, positive_phase
-from memcomp_lightning.types import Configurations, NegativePhase
+from memcomp_lightning.samplers.base import require_sampler
+from memcomp_lightning.types import Batch, Configurations, NegativePhase
 
 
 class Rates(NamedTuple):
@@ -114,17 +116,16 @@ def pretrain_layer(
     """
     require_count("iterations", iterations, minimum=0)
     rbm = dbn[layer]
-    yield from _follow_contrast(
+    training = ContrastTraining(
         rbm,
         lambda v: positive_phase(rbm, dbn.visible_of(layer, v)),
-        batches,
         sampler,
-        passes=range(layer * iterations, (layer + 1) * iterations),
         rates=rates,
         centring=centring,
         generator=generator,
     )
-    _check_finite(rbm, f"pretraining, layer {layer + 1}")
+    epochs = range(layer * iterations, (layer + 1) * iterations)
+    yield from _passes(training, batches, epochs, f"pretraining, layer {layer + 1}")
 
 
 def pretrain_jointly(
@@ -174,53 +175,126 @@ def pretrain_machine(
     require_count("iterations", iterations, minimum=0)
     device = model.b.device
     of_data = rng.stream(seed, "positive_phase", device=device)
-    yield from _follow_contrast(
+    training = ContrastTraining(
         model,
         lambda v: positive.sample(model, v, generator=of_data).configurations,
-        batches,
         sampler,
-        passes=range(iterations),
         rates=rates,
         centring=centring,
         generator=rng.stream(seed, "negative_phase", device=device),
     )
-    _check_finite(model, "pretraining")
+    yield from _passes(training, batches, range(iterations), "pretraining")
 
 
-def _follow_contrast(
-    model: Any,
-    positive_of: Callable[[Tensor], Configurations],
-    batches: Batches,
-    sampler: NegativePhaseSampler[Any, Any],
-    *,
-    passes: range,
-    rates: Rates,
-    centring: Centring | None,
-    generator: Generator,
-) -> Iterator[Pass]:
-    """Train one model in place, in passes of these numbers; yield each once it is done."""
-    optimizer, state = rates.optimizer(model.parameters()), None
-    offsets: Offsets | None = None
-    for done, epoch in enumerate(passes):
-        rates.begin_pass(optimizer, done)
-        batches.set_epoch(epoch)
+class ContrastTraining:
+    """One model that follows the contrast: its optimiser, its chains and its centres, kept from pass to pass.
+
+    Can be pickled where ``positive_of`` can.
+
+    Args:
+        model: The energy model; trained in place.
+        positive_of: Maps visible states ``(*replicas, n, n_visible)`` to configurations, without the weights.
+        sampler: Supplies the negative phase.
+        rates: Optimiser and momentum.
+        centring: Settings of the centred gradient; None follows the plain one.
+        generator: Random stream of the negative phase.
+
+    Attributes:
+        passes_done: How many.
+        state: Of the sampler; None before the first update.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        positive_of: Callable[[Tensor], Configurations],
+        sampler: NegativePhaseSampler[Any, Any],
+        *,
+        rates: Rates,
+        centring: Centring | None,
+        generator: Generator,
+    ) -> None:
+        require_sampler("sampler", sampler)
+        self.model = model
+        self.positive_of = positive_of
+        self.sampler = sampler
+        self.rates = rates
+        self.centring = centring
+        self.generator = generator
+        self.optimizer = rates.optimizer(model.parameters())
+        self.passes_done = 0
+        self.state: Any = None
+        self._offsets: Offsets | None = None
+
+    def run_pass(self, batches: Iterable[Batch]) -> Pass:
+        """Update the model by each step of the batches, once."""
+        with with_gradient():
+            return self._run_pass(batches)
+
+    def _run_pass(self, batches: Iterable[Batch]) -> Pass:
+        model, sampler = self.model, self.sampler
+        self.rates.begin_pass(self.optimizer, self.passes_done)
         negative: NegativePhase[Any] | None = None
         for batch in batches:
             with torch.no_grad():
-                positive = positive_of(batch.v)
-            if state is None:
-                state = sampler.init(model, positive.v.shape[-2], generator=generator)
-            if negative is None and centring is not None:
-                offsets = centring.follow(offsets, positive)
+                positive = weighted(self.positive_of(batch.v), batch.weight)
+            if self.state is None:
+                self.state = sampler.init(model, positive.v.shape[-2], generator=self.generator)
+            if negative is None and self.centring is not None:
+                self._offsets = self.centring.follow(self._offsets, positive)
             if negative is None or sampler.uses_data:
-                negative = sampler.sample(model, state, positive, generator=generator)
-                state = negative.state
-            (batch.share * contrast(model, positive, negative.configurations, offsets).sum()).backward()
+                negative = sampler.sample(model, self.state, positive, generator=self.generator)
+                self.state = negative.state
+            gap = contrast(model, positive, negative.configurations, self._offsets)
+            (batch.share * gap.sum()).backward()
             if batch.closes_step:
-                optimizer.step()
-                optimizer.zero_grad()
+                self.optimizer.step()
+                self.optimizer.zero_grad()
                 negative = None
-        yield Pass(done + 1, state, positive)
+        self.passes_done += 1
+        return Pass(self.passes_done, self.state, positive)
+
+
+def _passes(training: ContrastTraining, batches: Batches, epochs: range, where: str) -> Iterator[Pass]:
+    """One pass an epoch; yield each once it is done."""
+    for epoch in epochs:
+        batches.set_epoch(epoch)
+        yield training.run_pass(batches)
+    require_finite(training.model, where)
+
+
+class Backpropagation:
+    """A network that follows the gradient of its loss: its optimiser, kept from pass to pass.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits; trained in place.
+        rates: Optimiser and momentum.
+        loss: Of each image.
+
+    Attributes:
+        passes_done: How many.
+    """
+
+    def __init__(self, network: nn.Module, *, rates: Rates, loss: Loss = cross_entropy) -> None:
+        self.network = network
+        self.rates = rates
+        self.loss = loss
+        self.optimizer = rates.optimizer(network.parameters())
+        self.passes_done = 0
+
+    def run_pass(self, batches: Iterable[Batch]) -> None:
+        """Update the network by each step of the batches, once; it is in evaluation mode afterwards."""
+        self.network.train()
+        self.rates.begin_pass(self.optimizer, self.passes_done)
+        with with_gradient():
+            add_gradient = gradient_of(self.network, self.loss)
+            for batch in batches:
+                add_gradient(batch)
+                if batch.closes_step:
+                    self.optimizer.step()
+                    self.optimizer.zero_grad()
+        self.network.eval()
+        self.passes_done += 1
 
 
 def finetune(
@@ -241,21 +315,19 @@ def finetune(
         DivergedError: A parameter left the finite numbers.
     """
     require_count("iterations", iterations)
-    optimizer, add_gradient = rates.optimizer(network.parameters()), gradient_of(network, loss)
+    training = Backpropagation(network, rates=rates, loss=loss)
     for iteration in range(iterations):
-        network.train()
-        rates.begin_pass(optimizer, iteration)
         batches.set_epoch(iteration)
-        for batch in batches:
-            add_gradient(batch)
-            if batch.closes_step:
-                optimizer.step()
-                optimizer.zero_grad()
-        network.eval()
+        training.run_pass(batches)
         yield iteration + 1
-    _check_finite(network, "fine-tuning")
+    require_finite(network, "fine-tuning")
 
 
-def _check_finite(module: nn.Module, where: str) -> None:
+def require_finite(module: nn.Module, where: str) -> None:
+    """Raise if a parameter left the finite numbers.
+
+    Raises:
+        DivergedError: Naming the parameter.
+    """
     if (diverged := diverged_parameter(module)) is not None:
         raise DivergedError(f"{where}: {diverged}. Lower the learning rate.")

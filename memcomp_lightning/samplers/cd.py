@@ -55,13 +55,13 @@ class CD:
     def sample(
         self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
-        """Return one configuration an image, k sweeps away from it."""
+        """Return one configuration an image, k sweeps away from it, with the image's weight."""
         if has_classes(model):
             chains = chains_of(model)
             x = torch.cat((positive.v, rng.bernoulli(positive.h, generator=generator)), dim=-1)
             for _ in range(self.k):
                 x = chains.sweep(x, generator=generator)
-            return NegativePhase(chains.read(x), state, {})
+            return NegativePhase(chains.read(x)._replace(weight=positive.weight), state, {})
         # The first half sweep takes the hidden means that the positive phase has computed already.
         h = rng.bernoulli(positive.h, generator=generator)
         for _ in range(self.k - 1):
@@ -73,4 +73,4 @@ class CD:
         h = model.hidden_mean(v)
         if self.hidden == "sample":
             h = rng.bernoulli(h, generator=generator)
-        return NegativePhase(Configurations(v, h), state, {})
+        return NegativePhase(Configurations(v, h, positive.weight), state, {})

@@ -20,7 +20,7 @@ from numba import njit
 from running import Outcome
 
 from memcomp_lightning import compiling
-from memcomp_lightning.cli import pipeline
+from memcomp_lightning.cli import pipeline, trainers
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
 from memcomp_lightning.cli.errors import UserError
@@ -211,7 +211,7 @@ def test_ctrl_c_while_a_command_is_checked(memcomp_train: Run, monkeypatch: pyte
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "make_trainer", interrupt)
+    monkeypatch.setattr(trainers, "check_trainer", interrupt)
     outcome = memcomp_train(*SHORT)
     assert outcome.status == 130
     assert outcome.err == "\nmemcomp-train: interrupted.\n"

@@ -1,0 +1,350 @@
+"""The deep belief network as a classifier."""
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import ClassifierMixin
+from sklearn.model_selection import train_test_split
+from sklearn.utils.multiclass import _check_partial_fit_first_call, check_classification_targets
+from sklearn.utils.validation import column_or_1d
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.ambient import on_the_cpu
+from memcomp_lightning.dmm import DmmSolver
+from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.estimators.base import (
+    Drawn,
+    MemcompEstimator,
+    Patience,
+    array_of,
+    dbn_for,
+    in_precision_of,
+    seed_of,
+    sgd,
+)
+from memcomp_lightning.estimators.inputs import Matrix, Scaling, batches_of, hidden_means, weights_of
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import DBNClassifier
+from memcomp_lightning.replicas import Backpropagation, Rates, pretrain, pretrain_jointly, require_finite
+from memcomp_lightning.samplers import GroundState, MeanField
+
+UNLABELLED = -1
+"""Label of the samples that have none, where the other labels are numbers."""
+
+
+class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[misc]
+    """Deep belief network: layers pretrained by any sampler, then back-propagation with an output layer.
+
+    Inputs are scaled, and their precision is kept, as in :class:`MemcompRBM`.
+
+    Samples with the label -1 have none, as in scikit-learn's semi-supervised estimators: layers are pretrained on
+    them as well, and -1 is no class. Only where -1 and 1 are all the labels both are classes. Among strings it is
+    the number -1 in an array of objects; the string "-1" is a label.
+
+    Args:
+        hidden_layer_sizes: Units of each hidden layer; an integer for one layer.
+        sampler: Supplies the negative phase of pretraining; None is the DMM's ground state, as in the paper. Its
+            settings are ``sampler__solver__n_restarts`` and so on, for ``set_params`` and searches.
+        pretrain: "greedy", one layer after the other, or "joint", all of them as a deep Boltzmann machine.
+        n_iter_pretrain: Passes of pretraining for each layer, >= 0.
+        pretrain_learning_rate: Of pretraining, > 0.
+        pretrain_batch_size: Samples an update of pretraining, >= 1; None means all.
+        n_iter: Passes of back-propagation, >= 1; with ``early_stopping`` at most so many.
+        learning_rate: Of back-propagation, > 0.
+        momentum: Of back-propagation, in [0, 1).
+        batch_size: Samples an update of back-propagation, >= 1; None means all.
+        weight_std: Standard deviation of the first weights, > 0.
+        early_stopping: Hold out labelled samples, the same share of each class, stop once their accuracy no longer
+            rises, and keep the weights of the best pass. Layers are not pretrained on them either.
+        validation_fraction: Share held out, in (0, 1).
+        n_iter_no_change: Passes without a better accuracy, >= 1, after which training stops.
+        tol: By how much an accuracy must be better to count, >= 0.
+        verbose: Print a line a pass of back-propagation.
+        random_state: Seed, generator or None, as everywhere in scikit-learn; NumPy's ``Generator`` too.
+
+    Attributes:
+        classes_: Labels.
+        network_: The trained network: inputs to logits.
+        n_iter_: Passes of back-propagation done.
+        validation_scores_: Accuracy on the held-out samples after each pass; None without ``early_stopping``.
+
+    >>> import numpy as np
+    >>> classifier = MemcompDBNClassifier([3], n_iter_pretrain=2, n_iter=200, learning_rate=1.0, random_state=0)
+    >>> classifier.fit(np.eye(4), ["a", "b", "a", "b"]).predict(np.eye(4)).tolist()
+    ['a', 'b', 'a', 'b']
+    """
+
+    def __init__(
+        self,
+        hidden_layer_sizes: int | Sequence[int] = (32, 32),
+        *,
+        sampler: Any = None,
+        pretrain: Literal["greedy", "joint"] = "greedy",
+        n_iter_pretrain: int = 20,
+        pretrain_learning_rate: float = 0.1,
+        pretrain_batch_size: int | None = None,
+        n_iter: int = 100,
+        learning_rate: float = 0.1,
+        momentum: float = 0.9,
+        batch_size: int | None = 20,
+        weight_std: float = 0.1,
+        early_stopping: bool = False,
+        validation_fraction: float = 0.1,
+        n_iter_no_change: int = 10,
+        tol: float = 1e-4,
+        verbose: bool = False,
+        random_state: Any = None,
+    ) -> None:
+        self.hidden_layer_sizes = hidden_layer_sizes
+        self.sampler = sampler
+        self.pretrain = pretrain
+        self.n_iter_pretrain = n_iter_pretrain
+        self.pretrain_learning_rate = pretrain_learning_rate
+        self.pretrain_batch_size = pretrain_batch_size
+        self.n_iter = n_iter
+        self.learning_rate = learning_rate
+        self.momentum = momentum
+        self.batch_size = batch_size
+        self.weight_std = weight_std
+        self.early_stopping = early_stopping
+        self.validation_fraction = validation_fraction
+        self.n_iter_no_change = n_iter_no_change
+        self.tol = tol
+        self.verbose = verbose
+        self.random_state = random_state
+
+    def _default_sampler(self) -> GroundState:
+        return GroundState(solver=DmmSolver())
+
+    def fit(self, X: Any, y: Any, sample_weight: ArrayLike | None = None) -> "MemcompDBNClassifier":
+        """Train from new weights.
+
+        Args:
+            X: ``(n_samples, n_features)``, dense or sparse.
+            y: Labels, ``(n_samples,)``; the number -1 stands for none.
+            sample_weight: How often each sample counts in both stages, >= 0, ``(n_samples,)``; None means once.
+
+        Raises:
+            SettingError: A setting is out of range.
+            DivergedError: A parameter left the finite numbers.
+        """
+        self._check_settings()
+        X, y = self._read_labelled(X, y, reset=True)
+        weight = weights_of(sample_weight, X)
+        if weight is not None:
+            X, y, weight = X[weight > 0], y[weight > 0], weight[weight > 0]
+        labelled = _has_label(y)
+        self.classes_ = np.unique(y[labelled])
+        if len(self.classes_) < 2:
+            beside = "" if labelled.all() else f" beside {UNLABELLED}, which marks unlabelled samples"
+            raise ValueError(
+                f"y holds one class, {self.classes_.tolist()}{beside}: a classifier needs at least 2 classes."
+            )
+        seed = seed_of(self.random_state)
+        self._scaling = Scaling.of(X)
+        X, label = self._scaling.apply(X), self._encoded(y, labelled)
+        rows, held_out = np.flatnonzero(labelled), np.array([], dtype=np.int64)
+        if self.early_stopping:
+            rows, held_out = train_test_split(
+                rows, test_size=self.validation_fraction, random_state=seed, stratify=label[rows]
+            )
+        seen = np.setdiff1d(np.arange(X.shape[0]), held_out)
+
+        def part(of: NDArray[Any]) -> tuple[Matrix, NDArray[Any], NDArray[Any] | None]:
+            if len(of) == X.shape[0]:
+                return X, label, weight
+            return X[of], label[of], None if weight is None else weight[of]
+
+        with on_the_cpu():
+            self._begin(*part(seen), seed)
+            patience = Patience(self.network_, tol=self.tol, n_iter_no_change=self.n_iter_no_change)
+            batches, validation = self._batches(*part(np.sort(rows))), part(held_out)
+            for _ in range(self.n_iter):
+                self._run_pass(batches)
+                score = self._accuracy(*validation) if self.early_stopping else None
+                self._say(self.n_iter_, self.n_iter, score)
+                if score is not None and patience.ends_with(score):
+                    break
+            if self.early_stopping:
+                patience.restore()
+            require_finite(self.network_, "fine-tuning")
+        self.validation_scores_ = patience.scores if self.early_stopping else None
+        return self
+
+    def partial_fit(
+        self,
+        X: Any,
+        y: Any,
+        classes: ArrayLike | None = None,
+        sample_weight: ArrayLike | None = None,
+    ) -> "MemcompDBNClassifier":
+        """Do one pass of back-propagation over these samples; the optimiser goes on from the last call.
+
+        The first call, unless it follows ``fit``, draws the weights, settles the scaling and pretrains, all of it
+        on its own samples.
+
+        Args:
+            X: As in :meth:`fit`.
+            y: As in :meth:`fit`; -1 stands for none unless the classes are -1 and 1.
+            classes: All labels that will ever occur; needed in the first call.
+            sample_weight: As in :meth:`fit`.
+
+        Raises:
+            ValueError: ``classes`` is missing, has changed or holds -1, or y holds another label.
+            SettingError: A setting is out of range.
+            DivergedError: A parameter left the finite numbers.
+        """
+        self._check_settings()
+        self._refuse_early_stopping()
+        begins = not hasattr(self, "network_")
+        if _check_partial_fit_first_call(self, classes) and not _has_label(self.classes_).all():
+            given = self.classes_.tolist()
+            del self.classes_
+            raise ValueError(
+                f"classes holds {UNLABELLED}, which marks unlabelled samples, among {given}: leave it out. Only "
+                "beside 1 alone it is a class."
+            )
+        X, y = self._read_labelled(X, y, reset=begins)
+        weight = weights_of(sample_weight, X)
+        if weight is not None:
+            X, y, weight = X[weight > 0], y[weight > 0], weight[weight > 0]
+        known = np.isin(y, self.classes_)
+        labelled = known | ~_is_unlabelled(y)
+        if not known[labelled].all():
+            unknown = np.unique(y[labelled & ~known]).tolist()
+            raise ValueError(f"y holds {unknown}, which is not among the classes {self.classes_.tolist()}.")
+        if begins:
+            self._scaling = Scaling.of(X)
+        X, label = self._scaling.apply(X), self._encoded(y, labelled)
+        with on_the_cpu():
+            if begins:
+                self._begin(X, label, weight, seed_of(self.random_state))
+            for group in self._training.optimizer.param_groups:
+                group |= {"lr": self.learning_rate, "momentum": self.momentum}
+            X = X.astype(_numpy_dtype(self.network_), copy=False)
+            if labelled.any():
+                weight = None if weight is None else weight[labelled].astype(X.dtype)
+                self._run_pass(self._batches(X[labelled], label[labelled], weight))
+            require_finite(self.network_, "fine-tuning")
+        self.validation_scores_ = None
+        return self
+
+    def _check_settings(self) -> None:
+        require_choice("pretrain", self.pretrain, ("greedy", "joint"))
+        require_count("n_iter_pretrain", self.n_iter_pretrain, minimum=0)
+        require_count("n_iter", self.n_iter)
+        for name in ("batch_size", "pretrain_batch_size"):
+            if getattr(self, name) is not None:
+                require_count(name, getattr(self, name))
+        require(self.weight_std > 0, "weight_std", self.weight_std, "a number > 0")
+        sgd(self.learning_rate, self.momentum)
+        sgd(self.pretrain_learning_rate, name="pretrain_learning_rate")
+        self._check_early_stopping()
+        self._sizes()
+
+    def _sizes(self) -> list[int]:
+        sizes: list[Any] = np.atleast_1d(np.asarray(self.hidden_layer_sizes, dtype=object)).tolist()
+        require(len(sizes) > 0, "hidden_layer_sizes", self.hidden_layer_sizes, "at least one layer")
+        for size in sizes:
+            require_count("hidden_layer_sizes", size)
+        return [int(size) for size in sizes]
+
+    def _read_labelled(self, X: Any, y: Any, *, reset: bool) -> tuple[Matrix, NDArray[Any]]:
+        X, y = self._read(X, y, reset=reset, multi_output=True)
+        if y.ndim == 2 and y.shape[1] > 1:
+            raise ValueError(
+                f"y has the shape {y.shape}: expected one label a sample, y should be a 1d array. For several "
+                "labels a sample use sklearn.multioutput.MultiOutputClassifier."
+            )
+        y = column_or_1d(y, warn=True)
+        if len(labels := y[~_is_unlabelled(y)]):
+            check_classification_targets(labels)
+        return X, y
+
+    def _encoded(self, y: NDArray[Any], labelled: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Indices of the classes; 0 for unlabelled samples, which is not looked at."""
+        label = np.zeros(len(y), dtype=np.int64)
+        label[labelled] = np.searchsorted(self.classes_, y[labelled])
+        return label
+
+    def _begin(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None, seed: int) -> None:
+        """Draw and pretrain the layers, draw the output layer."""
+        dbn = dbn_for(X, self._sizes(), std=self.weight_std, generator=rng.stream(seed, "weights"))
+        sampler = self._default_sampler() if self.sampler is None else self.sampler
+        batches = batches_of(X, label, weight, batch_size=self.pretrain_batch_size, sampler=sampler, seed=seed)
+        rates = Rates(sgd(self.pretrain_learning_rate))
+        if self.pretrain == "joint":
+            pretrain_jointly(
+                dbn, batches, sampler, MeanField(), iterations=self.n_iter_pretrain, rates=rates, seed=seed
+            )
+        else:
+            pretrain(dbn, batches, sampler, iterations=self.n_iter_pretrain, rates=rates, seed=seed)
+        self.network_ = self._with_output(dbn, rng.stream(seed, "output weights"))
+        self._seed, self.n_iter_ = seed, 0
+        self._training = Backpropagation(self.network_, rates=Rates(sgd(self.learning_rate, self.momentum)))
+
+    def _with_output(self, dbn: DBN, generator: torch.Generator) -> torch.nn.Module:
+        init = Drawn(self.weight_std, dbn[0].weight.dtype)
+        module = DBNClassifier(dbn, n_classes=len(self.classes_), output_init=init, generator=generator)
+        network: torch.nn.Module = module.network
+        return network
+
+    def _batches(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None) -> Any:
+        return batches_of(X, label, weight, batch_size=self.batch_size, seed=self._seed)
+
+    def _run_pass(self, batches: Any) -> None:
+        batches.set_epoch(self.n_iter_)
+        self._training.run_pass(batches)
+        self.n_iter_ += 1
+
+    def _accuracy(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None) -> float:
+        right = self._logits(self.network_, X).argmax(-1).numpy() == label
+        return float(np.average(right, weights=weight))
+
+    @torch.no_grad()
+    def _logits(self, network: Any, X: Matrix) -> Tensor:
+        dbn, output = network
+        h = hidden_means(dbn[0], X)
+        for rbm in list(dbn)[1:]:
+            h = rbm(h)
+        logits: Tensor = output(h)
+        return logits
+
+    def predict_proba(self, X: Any) -> NDArray[Any]:
+        """Probability of each class, ``(n_samples, n_classes)``, in the precision of X."""
+        X = self._checked(X)
+        with on_the_cpu():
+            data, network = in_precision_of(X, self.network_)
+            return array_of(torch.softmax(self._logits(network, data), dim=-1), like=X)
+
+    def predict(self, X: Any) -> NDArray[Any]:
+        """Most probable label of each sample."""
+        best = self.predict_proba(X).argmax(-1)
+        labels: NDArray[Any] = self.classes_[best]
+        return labels
+
+
+def _is_unlabelled(y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a label is the number -1."""
+    if y.dtype.kind in "iuf":
+        return np.asarray(y == UNLABELLED)
+    if y.dtype.kind == "O":
+        return np.array([isinstance(label, Real) and label == UNLABELLED for label in y], dtype=bool)
+    return np.zeros(len(y), dtype=bool)
+
+
+def _has_label(y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a sample has a label: everywhere if -1 and 1 are all that there is."""
+    unlabelled = _is_unlabelled(y)
+    if unlabelled.any() and not unlabelled.all() and set(y.tolist()) == {-1, 1}:
+        return np.ones(len(y), dtype=bool)
+    return ~unlabelled
+
+
+def _numpy_dtype(network: torch.nn.Module) -> type[np.floating[Any]]:
+    return np.float64 if next(network.parameters()).dtype == torch.float64 else np.float32

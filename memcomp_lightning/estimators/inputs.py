@@ -1,0 +1,180 @@
+"""What the estimators do with a matrix before the units see it: precision, scaling, weights, batches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from numpy.typing import NDArray
+from sklearn.utils.sparsefuncs import min_max_axis
+from sklearn.utils.validation import _check_sample_weight
+from torch import Tensor
+
+from memcomp_lightning.data import Batches, SparseRows
+from memcomp_lightning.models import RBM
+from memcomp_lightning.samplers import ModeAssisted
+
+Matrix = Any
+"""An array ``(n_samples, n_features)``, or a SciPy matrix in CSR form."""
+
+MOST_NUMBERS = 2**22
+"""Numbers of a sparse matrix that are held densely at once, but for a mini-batch that has more."""
+
+MOST_REPEATS = 10
+"""Mean weight up to which samples of whole weights are repeated in mini-batches."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scaling:
+    """Maps the columns that leave [0, 1] in the training data to [0, 1] by their range, and clips all.
+
+    Attributes:
+        low: What becomes 0, a number a column; 0 in the columns that are left as they are.
+        width: By how much more something becomes 1; 1 in the columns that are left as they are.
+    """
+
+    low: NDArray[Any]
+    width: NDArray[Any]
+
+    @classmethod
+    def of(cls, X: Matrix) -> "Scaling":
+        """Return the scaling of training data."""
+        low, high = min_max_axis(X, axis=0) if sp.issparse(X) else (X.min(0), X.max(0))
+        leaves = ((low < 0) | (high > 1)) & (low < high)
+        return cls(np.where(leaves, low, 0), np.where(leaves, high - low, 1).astype(X.dtype))
+
+    def apply(self, X: Matrix) -> Matrix:
+        """Return intensities in [0, 1], of the type and in the precision of X; X is not changed."""
+        if not sp.issparse(X):
+            return self._columns(X, slice(None))
+        moved = self.low != 0
+        if moved.any():  # zeros of these columns become other numbers
+            full = sp.csr_array(self._columns(X[:, np.flatnonzero(moved)].toarray(), moved))
+            places = np.concatenate((np.flatnonzero(~moved), np.flatnonzero(moved)))
+            rest = Scaling(self.low[~moved], self.width[~moved]).apply(X[:, np.flatnonzero(~moved)])
+            return sp.csr_array(sp.hstack([rest, full]).tocsr()[:, np.argsort(places)])
+        X = sp.csr_array(X, copy=True)
+        X.sum_duplicates()
+        X.data = np.clip(X.data / self.width.astype(X.dtype)[X.indices], 0, 1)
+        return X
+
+    def to_data(self, states: NDArray[Any]) -> NDArray[Any]:
+        """Return states in {0, 1} in the units of the data: the ends of the range of a scaled column."""
+        width, low = self.width.astype(states.dtype), self.low.astype(states.dtype)
+        in_units: NDArray[Any] = states * width + low
+        return in_units
+
+    def _columns(self, X: NDArray[Any], columns: Any) -> NDArray[Any]:
+        low, width = self.low[columns].astype(X.dtype), self.width[columns].astype(X.dtype)
+        if (width != 1).any() or low.any():
+            X = (X - low) / width
+        if X.size and (X.min() < 0 or X.max() > 1):
+            X = X.clip(0, 1)
+        return X
+
+
+def weights_of(sample_weight: Any, X: Matrix) -> NDArray[Any] | None:
+    """Return checked weights in the precision of X; None where all are 1.
+
+    Raises:
+        ValueError: Their number is wrong, one is negative or not finite, or all are zero.
+    """
+    if sample_weight is None:
+        return None
+    weight = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
+    if not weight.any():
+        raise ValueError("sample_weight is zero for every sample: at least one weight must be > 0.")
+    checked: NDArray[Any] = weight
+    return None if (checked == 1).all() else checked
+
+
+def log_odds_of(X: Matrix, weight: NDArray[Any] | None) -> NDArray[Any]:
+    """Return log (n_on + 1) / (n_off + 1) of each column, where a sample counts as often as its weight says.
+
+    Weights that add up to less than the number of samples are multiplied until they do: a small scale of weights
+    says nothing about how much data there is.
+    """
+    if weight is None:
+        n, n_on = float(X.shape[0]), np.asarray(X.sum(0)).ravel()
+    else:
+        n = max(float(weight.sum()), float(len(weight)))
+        n_on = n * np.asarray((weight / weight.sum()) @ X).ravel()
+    odds: NDArray[Any] = np.log((n_on + 1) / (n - n_on + 1))
+    return odds
+
+
+def batches_of(
+    X: Matrix,
+    label: NDArray[Any] | None,
+    weight: NDArray[Any] | None,
+    *,
+    batch_size: int | None,
+    sampler: object = None,
+    seed: int,
+) -> Batches:
+    """Return the batches of scaled data, whose weights are > 0.
+
+    In mini-batches a sample of weight 2 is the same as the sample twice: samples of whole weights are repeated. Of
+    other weights, or large ones, a sample of r times the mean weight is laid out as r copies, rounded up, that
+    share its weight: no batch is all one heavy sample, and no step is far longer than the others. The order in
+    which the samples are given does not matter.
+    """
+    n_counted = X.shape[0] if weight is None else float(weight.sum())
+    if batch_size is not None and batch_size < max(X.shape[0], n_counted):
+        rows, weight = _laid_out(X, label, weight)
+        X, label = X[rows], None if label is None else label[rows]
+    if weight is not None and (weight == weight[0]).all():
+        weight = None
+    n, n_features = X.shape
+    size = None if batch_size is None or batch_size >= n else batch_size
+    chunk = max(1, MOST_NUMBERS // n_features) if sp.issparse(X) else 10_000
+    # A mode-assisted step is one toss of its coin, so it is not cut.
+    chunk = n if isinstance(sampler, ModeAssisted) else max(chunk, size or 0)
+    labels = torch.zeros(n, dtype=torch.long) if label is None else torch.from_numpy(label).long()
+    weights = None if weight is None else torch.from_numpy(weight)
+    return Batches(tensor_of(X), labels, size, chunk, shuffle=True, seed=seed, weight=weights)
+
+
+def _laid_out(
+    X: Matrix, label: NDArray[Any] | None, weight: NDArray[Any] | None
+) -> tuple[NDArray[np.int64], NDArray[Any] | None]:
+    """Return the rows that mini-batches are made of, in an order that the data alone settle, and their weights."""
+    direction, step = np.random.default_rng(0).standard_normal(X.shape[1]), max(1, MOST_NUMBERS // X.shape[1])
+    parts = [X[first : first + step].astype(np.float64) @ direction for first in range(0, X.shape[0], step)]
+    # Rounded, because equal rows may differ in the last bits.
+    place = np.concatenate(parts).round(9)
+    order = np.lexsort((place,) if label is None else (label, place))
+    if weight is None:
+        return order, None
+    weight = weight[order]
+    if (weight == np.round(weight)).all() and weight.mean() <= MOST_REPEATS:
+        return order.repeat(weight.astype(np.int64)), None
+    weight = weight / weight.mean()
+    copies = np.ceil(weight - 1e-6).astype(np.int64)
+    return order.repeat(copies), (weight / copies).repeat(copies)
+
+
+def tensor_of(X: Matrix) -> Tensor | SparseRows:
+    """Return the same numbers for torch."""
+    if sp.issparse(X):
+        start, unit = (torch.from_numpy(part.astype(np.int64)) for part in (X.indptr, X.indices))
+        return SparseRows(start, unit, torch.from_numpy(X.data), X.shape[1])
+    # torch warns of arrays that it must not write to, as those that joblib maps into memory.
+    return torch.from_numpy(np.ascontiguousarray(X) if X.flags.writeable else X.copy())
+
+
+def dense_parts(X: Matrix, rows: int | None = None) -> Any:
+    """Yield dense tensors that together have the rows of X, not too many at a time."""
+    rows = rows or max(1, MOST_NUMBERS // X.shape[1])
+    for first in range(0, X.shape[0], rows):
+        part = X[first : first + rows]
+        yield tensor_of(part.toarray() if sp.issparse(part) else part)
+
+
+def hidden_means(rbm: RBM, X: Matrix) -> Tensor:
+    """Return E[h | v] of each row, ``(n_samples, n_hidden)``; a sparse matrix stays sparse."""
+    if not sp.issparse(X):
+        return rbm.hidden_mean(torch.as_tensor(tensor_of(X)))
+    field = np.asarray(X @ np.ascontiguousarray(rbm.weight.detach().numpy().T))
+    return torch.sigmoid(torch.from_numpy(field) + rbm.c)

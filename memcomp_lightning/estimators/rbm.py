@@ -1,0 +1,342 @@
+"""The restricted Boltzmann machine as a transformer."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import ClassNamePrefixFeaturesOutMixin, TransformerMixin
+from sklearn.model_selection import train_test_split
+from sklearn.utils.validation import check_is_fitted
+
+from memcomp_lightning import rng
+from memcomp_lightning.ambient import on_the_cpu
+from memcomp_lightning.defaults import BATCH_SIZE, CENTRING_RATE, LEARNING_RATE, N_CHAINS, WEIGHT_STD
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.estimators.base import (
+    MemcompEstimator,
+    Patience,
+    array_of,
+    dbn_for,
+    in_precision_of,
+    seed_of,
+    sgd,
+)
+from memcomp_lightning.estimators.inputs import (
+    Matrix,
+    Scaling,
+    batches_of,
+    dense_parts,
+    hidden_means,
+    log_odds_of,
+    weights_of,
+)
+from memcomp_lightning.likelihood import (
+    Ais,
+    exact_samples,
+    log_likelihood,
+    log_partition_function,
+    log_pseudo_likelihood,
+)
+from memcomp_lightning.models import RBM
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.replicas import ContrastTraining, Rates, require_finite
+from memcomp_lightning.samplers import PCD, gibbs, positive_phase
+
+MOST_ENUMERATED = 20
+"""Units of the smaller layer up to which a log-likelihood is exact."""
+
+
+class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstimator):  # type: ignore[misc]
+    """Bernoulli RBM whose negative phase is any sampler of this package.
+
+    Values in [0, 1] stand for probabilities. Columns within [0, 1] are left as they are; one that leaves [0, 1] is
+    scaled to it by its range in ``fit``, and a constant one outside counts as 0 below and as 1 above. Later values
+    are clipped. Dense and sparse (CSR) inputs give the same; of a sparse one no more than a mini-batch is made
+    dense. Training and results are in the precision of the input, float32 or float64.
+
+    The visible biases start at the log odds of the data's means (Hinton 2010, section 8).
+
+    Args:
+        n_components: Hidden units, >= 1.
+        sampler: Supplies the negative phase; None is ``PCD(n_chains=100)``. Its settings are ``sampler__k`` and so
+            on, for ``set_params`` and searches.
+        learning_rate: Of plain gradient descent, > 0.
+        batch_size: Samples an update, >= 1; None means all.
+        n_iter: Passes over the data, >= 1; with ``early_stopping`` at most so many.
+        centred: Follow the centred gradient.
+        early_stopping: Hold out samples, stop once their :meth:`score` no longer rises, and keep the weights of
+            the best pass.
+        validation_fraction: Share held out, in (0, 1).
+        n_iter_no_change: Passes without a better score, >= 1, after which training stops.
+        tol: By how much a score must be better to count, in nats, >= 0.
+        verbose: Print a line a pass.
+        random_state: Seed, generator or None, as everywhere in scikit-learn; NumPy's ``Generator`` too.
+
+    Attributes:
+        rbm_: The trained :class:`memcomp_lightning.models.RBM`.
+        components_: Its weights, ``(n_components, n_features)``.
+        intercept_hidden_: Hidden biases.
+        intercept_visible_: Visible biases.
+        n_iter_: Passes done.
+        validation_scores_: Score of the held-out samples after each pass; None without ``early_stopping``.
+
+    >>> import numpy as np
+    >>> MemcompRBM(n_components=2, n_iter=3, random_state=0).fit_transform(np.eye(4)).shape
+    (4, 2)
+    """
+
+    def __init__(
+        self,
+        n_components: int = 64,
+        *,
+        sampler: Any = None,
+        learning_rate: float = LEARNING_RATE,
+        batch_size: int | None = BATCH_SIZE,
+        n_iter: int = 10,
+        centred: bool = True,
+        early_stopping: bool = False,
+        validation_fraction: float = 0.1,
+        n_iter_no_change: int = 10,
+        tol: float = 1e-4,
+        verbose: bool = False,
+        random_state: Any = None,
+    ) -> None:
+        self.n_components = n_components
+        self.sampler = sampler
+        self.learning_rate = learning_rate
+        self.batch_size = batch_size
+        self.n_iter = n_iter
+        self.centred = centred
+        self.early_stopping = early_stopping
+        self.validation_fraction = validation_fraction
+        self.n_iter_no_change = n_iter_no_change
+        self.tol = tol
+        self.verbose = verbose
+        self.random_state = random_state
+
+    def _default_sampler(self) -> PCD:
+        return PCD(n_chains=N_CHAINS)
+
+    def fit(self, X: Any, y: Any = None, sample_weight: ArrayLike | None = None) -> "MemcompRBM":
+        """Train from new weights.
+
+        Args:
+            X: ``(n_samples, n_features)``, dense or sparse.
+            y: Not used.
+            sample_weight: How often each sample counts, >= 0, ``(n_samples,)``; None means once.
+
+        Raises:
+            SettingError: A setting is out of range.
+            DivergedError: A parameter left the finite numbers.
+        """
+        self._check_settings()
+        X = self._read(X, reset=True)
+        weight = weights_of(sample_weight, X)
+        if weight is not None:
+            X, weight = X[weight > 0], weight[weight > 0]
+        seed = seed_of(self.random_state)
+        self._scaling = Scaling.of(X)
+        X = self._scaling.apply(X)
+        held_out, held_out_weight = None, None
+        if self.early_stopping:
+            rows, others = train_test_split(
+                np.arange(X.shape[0]), test_size=self.validation_fraction, random_state=seed
+            )
+            held_out, held_out_weight = X[others], None if weight is None else weight[others]
+            X, weight = X[rows], None if weight is None else weight[rows]
+        with on_the_cpu():
+            self._begin(X, weight, seed)
+            patience = Patience(self.rbm_, tol=self.tol, n_iter_no_change=self.n_iter_no_change)
+            batches = self._batches(X, weight)
+            for _ in range(self.n_iter):
+                self._run_pass(batches)
+                score = None
+                if held_out is not None:
+                    score = float(np.average(self._pseudo_likelihood(held_out), weights=held_out_weight))
+                self._say(self.n_iter_, self.n_iter, score)
+                if score is not None and patience.ends_with(score):
+                    break
+            if held_out is not None:
+                patience.restore()
+        self.validation_scores_ = patience.scores if self.early_stopping else None
+        return self
+
+    def partial_fit(self, X: Any, y: Any = None, sample_weight: ArrayLike | None = None) -> "MemcompRBM":
+        """Do one pass over these samples; chains, centres and optimiser go on from the last call, or from ``fit``.
+
+        The first call draws the weights and settles scaling and first biases by its samples. Arguments and errors
+        are those of :meth:`fit`.
+        """
+        self._check_settings()
+        self._refuse_early_stopping()
+        begins = not hasattr(self, "rbm_")
+        X = self._read(X, reset=begins)
+        weight = weights_of(sample_weight, X)
+        if weight is not None:
+            X, weight = X[weight > 0], weight[weight > 0]
+        if begins:
+            self._scaling = Scaling.of(X)
+        X = self._scaling.apply(X)
+        with on_the_cpu():
+            if begins:
+                self._begin(X, weight, seed_of(self.random_state))
+            training = self._training
+            for group in training.optimizer.param_groups:
+                group["lr"] = self.learning_rate
+            if training.sampler != self._negative_phase():
+                training.sampler, training.state = self._negative_phase(), None
+            training.centring = self._centring()
+            # Data of another precision than the model's take the model's.
+            X = X.astype(self.components_.dtype, copy=False)
+            weight = None if weight is None else weight.astype(X.dtype)
+            self._run_pass(self._batches(X, weight))
+        self.validation_scores_ = None
+        return self
+
+    def _check_settings(self) -> None:
+        require_count("n_components", self.n_components)
+        require_count("n_iter", self.n_iter)
+        if self.batch_size is not None:
+            require_count("batch_size", self.batch_size)
+        sgd(self.learning_rate)
+        self._check_early_stopping()
+
+    def _negative_phase(self) -> Any:
+        return self._default_sampler() if self.sampler is None else self.sampler
+
+    def _centring(self) -> Centring | None:
+        return Centring(rate=CENTRING_RATE) if self.centred else None
+
+    def _begin(self, X: Matrix, weight: NDArray[Any] | None, seed: int) -> None:
+        dbn = dbn_for(X, [int(self.n_components)], std=WEIGHT_STD, generator=rng.stream(seed, "weights"))
+        rbm = dbn[0]
+        self._base = torch.from_numpy(log_odds_of(X, weight)).to(rbm.b)
+        rbm.b.data.copy_(self._base)
+        self.rbm_, self.n_iter_, self._seed = rbm, 0, seed
+        self._training = ContrastTraining(
+            rbm,
+            partial(positive_phase, rbm),
+            self._negative_phase(),
+            rates=Rates(sgd(self.learning_rate)),
+            centring=self._centring(),
+            generator=rng.stream(seed, "negative_phase"),
+        )
+        self._gibbs_generator = rng.stream(seed, "gibbs")
+
+    def _batches(self, X: Matrix, weight: NDArray[Any] | None) -> Any:
+        sampler = self._negative_phase()
+        return batches_of(X, None, weight, batch_size=self.batch_size, sampler=sampler, seed=self._seed)
+
+    def _run_pass(self, batches: Any) -> None:
+        batches.set_epoch(self.n_iter_)
+        self._training.run_pass(batches)
+        require_finite(self.rbm_, "pretraining")
+        self.n_iter_ += 1
+
+    @property
+    def components_(self) -> NDArray[Any]:
+        """Weights, ``(n_components, n_features)``."""
+        return self._parameter("weight")
+
+    @property
+    def intercept_hidden_(self) -> NDArray[Any]:
+        """Hidden biases, ``(n_components,)``."""
+        return self._parameter("c")
+
+    @property
+    def intercept_visible_(self) -> NDArray[Any]:
+        """Visible biases, ``(n_features,)``."""
+        return self._parameter("b")
+
+    def _parameter(self, name: str) -> NDArray[Any]:
+        values: NDArray[Any] = getattr(self.rbm_, name).detach().numpy()
+        return values
+
+    @property
+    def _n_features_out(self) -> int:
+        return self.rbm_.n_hidden
+
+    def transform(self, X: Any) -> NDArray[Any]:
+        """Hidden means given the data, ``(n_samples, n_components)``, in the precision of X."""
+        X = self._checked(X)
+        with on_the_cpu(), torch.no_grad():
+            data, rbm = in_precision_of(X, self.rbm_)
+            return array_of(hidden_means(rbm, data), like=X)
+
+    def gibbs(self, v: Any) -> NDArray[Any]:
+        """One step of Gibbs sampling from each sample: hidden units given it, visible units given them.
+
+        Every call draws on from the random stream that ``fit`` began.
+
+        Returns:
+            Visible units, ``(n_samples, n_features)``, in the precision and in the units of the data: 0 and 1, or
+            the ends of the range of a column that is scaled.
+        """
+        X = self._checked(v)
+        with on_the_cpu(), torch.no_grad():
+            data, rbm = in_precision_of(X, self.rbm_)
+            parts = [gibbs.sweep(rbm, part, generator=self._gibbs_generator) for part in dense_parts(data)]
+            return self._scaling.to_data(array_of(torch.cat(parts), like=X))
+
+    def sample(self, n_samples: int = 1, *, n_steps: int = 1000, random_state: Any = None) -> NDArray[Any]:
+        """Draw samples from the model.
+
+        They are exact and independent with up to 20 hidden units or features. Otherwise each is the end of a Gibbs
+        chain that starts at independent features with the means of the data.
+
+        Args:
+            n_samples: How many, >= 1.
+            n_steps: Gibbs steps of a chain, >= 1.
+            random_state: Of the draws; None goes on with the stream that ``fit`` began.
+
+        Returns:
+            ``(n_samples, n_features)``, as of :meth:`gibbs`.
+        """
+        check_is_fitted(self)
+        require_count("n_samples", n_samples)
+        require_count("n_steps", n_steps)
+        generator = self._gibbs_generator
+        if random_state is not None:
+            generator = rng.stream(seed_of(random_state), "gibbs")
+        with on_the_cpu(), torch.no_grad():
+            if self._is_small():
+                v = exact_samples(self.rbm_, n_samples, generator=generator)
+            else:
+                v = rng.bernoulli(torch.sigmoid(self._base).expand(n_samples, -1), generator=generator)
+                for _ in range(n_steps):
+                    v = gibbs.sweep(self.rbm_, v, generator=generator)
+            return self._scaling.to_data(v.numpy())
+
+    def score_samples(self, X: Any) -> NDArray[np.float64]:
+        """Log pseudo-likelihood of each sample in nats, features rounded to 0 or 1, ``(n_samples,)`` float64."""
+        X = self._checked(X)
+        with on_the_cpu():
+            return self._pseudo_likelihood(X)
+
+    def _pseudo_likelihood(self, X: Matrix) -> NDArray[np.float64]:
+        parts = [log_pseudo_likelihood(self.rbm_, part.round()).sum(-1) for part in dense_parts(X)]
+        return torch.cat(parts).detach().numpy()
+
+    def score(self, X: Any, y: Any = None) -> float:
+        """Mean of :meth:`score_samples`: what a grid search maximises."""
+        return float(self.score_samples(X).mean())
+
+    def log_likelihood(self, X: Any) -> NDArray[np.float64]:
+        """Log-likelihood of each sample in nats, features rounded to 0 or 1, ``(n_samples,)`` float64.
+
+        Exact with up to 20 hidden units or features, otherwise by annealed importance sampling.
+        """
+        X = self._checked(X)
+        with on_the_cpu():
+            if self._is_small():
+                log_z = log_partition_function(self.rbm_)
+            else:
+                log_z = Ais().estimate(self.rbm_, generator=rng.stream(0, "ais"), base=self._base).log_z
+            parts = [log_likelihood(self.rbm_, part.round(), log_z) for part in dense_parts(X)]
+            return torch.cat(parts).detach().numpy()
+
+    def _is_small(self) -> bool:
+        rbm: RBM = self.rbm_
+        return min(rbm.n_visible, rbm.n_hidden) <= MOST_ENUMERATED
