@@ -1,10 +1,16 @@
-"""Settings of training by likelihood that the estimators and the configuration share."""
+"""Settings that a first user gets, whether in Python, from scikit-learn or on the command line.
+
+Chosen on held-out data: experiments/defaults. A test holds the files of ``conf`` against them.
+"""
 
 BATCH_SIZE = 20
-"""Samples an update."""
+"""Samples an update, in pretraining and in fine-tuning."""
+
+PASSES = 10
+"""Passes over the training set for an RBM."""
 
 LEARNING_RATE = 0.05
-"""Of plain gradient descent."""
+"""Of an RBM, by plain gradient descent."""
 
 N_CHAINS = 100
 """Persistent chains."""
@@ -14,3 +20,12 @@ CENTRING_RATE = 0.01
 
 WEIGHT_STD = 0.01
 """Standard deviation of the first weights."""
+
+FINETUNING_PASSES = 100
+"""Passes over the training set of back-propagation."""
+
+FINETUNING_LEARNING_RATE = 0.1
+"""Of back-propagation."""
+
+FINETUNING_MOMENTUM = 0.9
+"""Of back-propagation."""

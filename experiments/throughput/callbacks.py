@@ -77,7 +77,7 @@ def fit(
     images: ImageData, n_hidden: int, sampler: CD | PCD, n_passes: int, callbacks: list[pl.Callback]
 ) -> dict[str, list[float]]:
     """Train; seconds of each action of the profiler, call by call."""
-    module = DBNPretraining(DBN(N_VISIBLE, [n_hidden]), sampler, iterations=n_passes)
+    module = DBNPretraining(DBN(N_VISIBLE, [n_hidden]), sampler, iterations=n_passes, centring=None)
     profiler = SimpleProfiler()
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(

@@ -33,7 +33,7 @@ def lightning_epoch(images: ImageData) -> tuple[float, Tensor]:
     """One epoch through DBNPretraining, with callbacks and TensorBoard; seconds of training, final weights."""
     dbn = DBN(N_VISIBLE, [N_HIDDEN])
     optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
-    module = DBNPretraining(dbn, CD(k=1), iterations=1, optimizer=optimizer)
+    module = DBNPretraining(dbn, CD(k=1), iterations=1, optimizer=optimizer, centring=None)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             max_epochs=1,

@@ -4,7 +4,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.loading import Batches
 from memcomp_lightning.errors import require, require_count
@@ -46,7 +46,7 @@ class ImageDataModule(LightningDataModule):
         self,
         images: ImageData,
         *,
-        batch_size: int | None = 100,
+        batch_size: int | None = defaults.BATCH_SIZE,
         partitions: int = 1,
         first_partitions: int | None = None,
         validation_fraction: float = 0.0,

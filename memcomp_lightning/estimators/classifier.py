@@ -15,6 +15,15 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
+from memcomp_lightning.defaults import (
+    BATCH_SIZE,
+    CENTRING_RATE,
+    FINETUNING_LEARNING_RATE,
+    FINETUNING_MOMENTUM,
+    FINETUNING_PASSES,
+    LEARNING_RATE,
+    PASSES,
+)
 from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.estimators.base import (
@@ -27,9 +36,10 @@ from memcomp_lightning.estimators.base import (
     seed_of,
     sgd,
 )
-from memcomp_lightning.estimators.inputs import Matrix, Scaling, batches_of, hidden_means, weights_of
+from memcomp_lightning.estimators.inputs import Matrix, Scaling, batches_of, hidden_means, log_odds_of, weights_of
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier
+from memcomp_lightning.objective import Centring
 from memcomp_lightning.replicas import Backpropagation, Rates, pretrain, pretrain_jointly, require_finite
 from memcomp_lightning.samplers import GroundState, MeanField
 
@@ -54,6 +64,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         n_iter_pretrain: Passes of pretraining for each layer, >= 0.
         pretrain_learning_rate: Of pretraining, > 0.
         pretrain_batch_size: Samples an update of pretraining, >= 1; None means all.
+        centred: Follow the centred gradient in pretraining.
         n_iter: Passes of back-propagation, >= 1; with ``early_stopping`` at most so many.
         learning_rate: Of back-propagation, > 0.
         momentum: Of back-propagation, in [0, 1).
@@ -85,13 +96,14 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         *,
         sampler: Any = None,
         pretrain: Literal["greedy", "joint"] = "greedy",
-        n_iter_pretrain: int = 20,
-        pretrain_learning_rate: float = 0.1,
-        pretrain_batch_size: int | None = None,
-        n_iter: int = 100,
-        learning_rate: float = 0.1,
-        momentum: float = 0.9,
-        batch_size: int | None = 20,
+        n_iter_pretrain: int = PASSES,
+        pretrain_learning_rate: float = LEARNING_RATE,
+        pretrain_batch_size: int | None = BATCH_SIZE,
+        centred: bool = True,
+        n_iter: int = FINETUNING_PASSES,
+        learning_rate: float = FINETUNING_LEARNING_RATE,
+        momentum: float = FINETUNING_MOMENTUM,
+        batch_size: int | None = BATCH_SIZE,
         weight_std: float = 0.1,
         early_stopping: bool = False,
         validation_fraction: float = 0.1,
@@ -106,6 +118,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         self.n_iter_pretrain = n_iter_pretrain
         self.pretrain_learning_rate = pretrain_learning_rate
         self.pretrain_batch_size = pretrain_batch_size
+        self.centred = centred
         self.n_iter = n_iter
         self.learning_rate = learning_rate
         self.momentum = momentum
@@ -275,15 +288,20 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
     def _begin(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None, seed: int) -> None:
         """Draw and pretrain the layers, draw the output layer."""
         dbn = dbn_for(X, self._sizes(), std=self.weight_std, generator=rng.stream(seed, "weights"))
+        with torch.no_grad():
+            dbn[0].b.copy_(torch.from_numpy(log_odds_of(X, weight)))
         sampler = self._default_sampler() if self.sampler is None else self.sampler
         batches = batches_of(X, label, weight, batch_size=self.pretrain_batch_size, sampler=sampler, seed=seed)
-        rates = Rates(sgd(self.pretrain_learning_rate))
+        settings: dict[str, Any] = {
+            "iterations": self.n_iter_pretrain,
+            "rates": Rates(sgd(self.pretrain_learning_rate)),
+            "centring": Centring(rate=CENTRING_RATE) if self.centred else None,
+            "seed": seed,
+        }
         if self.pretrain == "joint":
-            pretrain_jointly(
-                dbn, batches, sampler, MeanField(), iterations=self.n_iter_pretrain, rates=rates, seed=seed
-            )
+            pretrain_jointly(dbn, batches, sampler, MeanField(), **settings)
         else:
-            pretrain(dbn, batches, sampler, iterations=self.n_iter_pretrain, rates=rates, seed=seed)
+            pretrain(dbn, batches, sampler, **settings)
         self.network_ = self._with_output(dbn, rng.stream(seed, "output weights"))
         self._seed, self.n_iter_ = seed, 0
         self._training = Backpropagation(self.network_, rates=Rates(sgd(self.learning_rate, self.momentum)))

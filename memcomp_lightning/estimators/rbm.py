@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
-from memcomp_lightning.defaults import BATCH_SIZE, CENTRING_RATE, LEARNING_RATE, N_CHAINS, WEIGHT_STD
+from memcomp_lightning.defaults import BATCH_SIZE, CENTRING_RATE, LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.estimators.base import (
     MemcompEstimator,
@@ -94,7 +94,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         sampler: Any = None,
         learning_rate: float = LEARNING_RATE,
         batch_size: int | None = BATCH_SIZE,
-        n_iter: int = 10,
+        n_iter: int = PASSES,
         centred: bool = True,
         early_stopping: bool = False,
         validation_fraction: float = 0.1,

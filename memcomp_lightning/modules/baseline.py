@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 from torch import Generator
 
+from memcomp_lightning import defaults
 from memcomp_lightning.models import BatchNormReluNetwork, Initialiser
 from memcomp_lightning.modules.classifier import Classifier
-from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
+from memcomp_lightning.modules.stage import FINETUNING_SGD, OptimizerFactory
 
 
 class BaselineClassifier(Classifier):
@@ -34,8 +35,8 @@ class BaselineClassifier(Classifier):
         *,
         n_classes: int = 10,
         replicas: tuple[int, ...] = (),
-        iterations: int = 100,
-        optimizer: OptimizerFactory = PAPER_SGD,
+        iterations: int = defaults.FINETUNING_PASSES,
+        optimizer: OptimizerFactory = FINETUNING_SGD,
         loss: str = "cross_entropy",
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from memcomp_lightning import defaults
 from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.losses import LOSSES, Loss, cross_entropy
-from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory, StageModule
+from memcomp_lightning.modules.stage import FINETUNING_SGD, OptimizerFactory, StageModule
 from memcomp_lightning.types import Batch
 
 
@@ -80,8 +81,8 @@ class Classifier(StageModule):
         self,
         network: nn.Module,
         *,
-        iterations: int = 100,
-        optimizer: OptimizerFactory = PAPER_SGD,
+        iterations: int = defaults.FINETUNING_PASSES,
+        optimizer: OptimizerFactory = FINETUNING_SGD,
         loss: str = "cross_entropy",
         seed: int = 0,
     ) -> None:

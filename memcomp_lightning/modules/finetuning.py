@@ -6,10 +6,11 @@ from typing import Literal
 from torch import Generator, nn
 from torch.nn import Parameter
 
+from memcomp_lightning import defaults
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.models import DBN, Initialiser, Linear, with_batch_norm_relu
 from memcomp_lightning.modules.classifier import Classifier
-from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
+from memcomp_lightning.modules.stage import FINETUNING_SGD, OptimizerFactory
 
 
 class DBNClassifier(Classifier):
@@ -32,8 +33,8 @@ class DBNClassifier(Classifier):
         dbn: DBN,
         *,
         n_classes: int = 10,
-        iterations: int = 100,
-        optimizer: OptimizerFactory = PAPER_SGD,
+        iterations: int = defaults.FINETUNING_PASSES,
+        optimizer: OptimizerFactory = FINETUNING_SGD,
         loss: str = "cross_entropy",
         units: Literal["sigmoid", "batch_norm_relu"] = "sigmoid",
         output_init: Initialiser | None = None,

@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.models import DBM, DBN, BoltzmannMachine
 from memcomp_lightning.modules.energy import EnergyPretraining
-from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
+from memcomp_lightning.modules.stage import PRETRAINING_SGD, OptimizerFactory
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import MeanField, NegativePhaseSampler, PositivePhase, PositivePhaseSampler
 from memcomp_lightning.samplers.base import require_state
@@ -44,8 +44,8 @@ class BoltzmannPretraining(EnergyPretraining):
         sampler: NegativePhaseSampler[Any, Any],
         *,
         positive: PositivePhaseSampler | None = None,
-        iterations: int = 50,
-        optimizer: OptimizerFactory = PAPER_SGD,
+        iterations: int = defaults.PASSES,
+        optimizer: OptimizerFactory = PRETRAINING_SGD,
         centring: Centring | None = None,
         seed: int = 0,
     ) -> None:

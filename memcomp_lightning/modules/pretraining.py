@@ -8,14 +8,16 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.modules.energy import EnergyPretraining
-from memcomp_lightning.modules.stage import PAPER_SGD, OptimizerFactory
+from memcomp_lightning.modules.stage import PRETRAINING_SGD, OptimizerFactory
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, positive_phase
 from memcomp_lightning.samplers.base import require_state
 from memcomp_lightning.types import Batch
+
+CENTRED = Centring(rate=defaults.CENTRING_RATE)
 
 
 class DBNPretraining(EnergyPretraining):
@@ -42,9 +44,9 @@ class DBNPretraining(EnergyPretraining):
         dbn: DBN,
         sampler: NegativePhaseSampler[RBM, Any],
         *,
-        iterations: int = 50,
-        optimizer: OptimizerFactory = PAPER_SGD,
-        centring: Centring | None = None,
+        iterations: int = defaults.PASSES,
+        optimizer: OptimizerFactory = PRETRAINING_SGD,
+        centring: Centring | None = CENTRED,
         seed: int = 0,
     ) -> None:
         super().__init__(sampler, iterations=iterations, optimizer=optimizer, centring=centring, seed=seed)

@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import Parameter
 from torch.optim import SGD, Optimizer
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.modules.trainers import check_trainer, tries
 
 OptimizerFactory = Callable[[Iterable[Parameter]], Optimizer]
@@ -42,8 +42,13 @@ def diverged_parameter(module: nn.Module, largest_allowed: float = LARGEST_WEIGH
     return None
 
 
-PAPER_SGD: OptimizerFactory = partial(SGD, lr=0.1)
-"""Learning rate of Manukian et al. 2019; its momentum comes from the MomentumSchedule callback."""
+PRETRAINING_SGD: OptimizerFactory = partial(SGD, lr=defaults.LEARNING_RATE)
+"""What trains energy models unless an optimiser is given."""
+
+FINETUNING_SGD: OptimizerFactory = partial(
+    SGD, lr=defaults.FINETUNING_LEARNING_RATE, momentum=defaults.FINETUNING_MOMENTUM
+)
+"""What trains classifiers unless an optimiser is given."""
 
 
 class StageModule(pl.LightningModule):

@@ -26,6 +26,8 @@ from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.estimators import MemcompDBNClassifier, MemcompRBM, inputs
 from memcomp_lightning.interop import AnnealerSamples
+from memcomp_lightning.models import DBN
+from memcomp_lightning.modules import DBNClassifier, DBNPretraining
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -649,3 +651,25 @@ def test_the_command_line_trains_by_the_same_defaults():
     assert pretrain.centring.rate == defaults.CENTRING_RATE
     assert config.sampler.n_chains == defaults.N_CHAINS
     assert config.model.weight_init.std == defaults.WEIGHT_STD
+    signature = {name: p.default for name, p in inspect.signature(MemcompDBNClassifier).parameters.items()}
+    assert pretrain.iterations == signature["n_iter_pretrain"]
+    assert pretrain.batch_size == signature["pretrain_batch_size"]
+    assert pretrain.optimizer.lr == signature["pretrain_learning_rate"]
+    assert config.finetune.iterations == signature["n_iter"]
+    assert config.finetune.batch_size == signature["batch_size"]
+    assert config.finetune.optimizer.lr == signature["learning_rate"]
+    assert config.finetune.optimizer.momentum == signature["momentum"]
+    assert signature["centred"]
+
+
+def test_modules_train_by_the_same_defaults():
+    parameter = [torch.nn.Parameter(torch.zeros(1))]
+    pretraining = DBNPretraining(DBN(3, [2]), PCD(n_chains=5))
+    assert pretraining.iterations == defaults.PASSES
+    assert pretraining.centring.rate == defaults.CENTRING_RATE
+    assert pretraining.make_optimizer(parameter).defaults["lr"] == defaults.LEARNING_RATE
+    classifier = DBNClassifier(DBN(3, [2]))
+    assert classifier.iterations == defaults.FINETUNING_PASSES
+    settings = classifier.make_optimizer(parameter).defaults
+    assert settings["lr"] == defaults.FINETUNING_LEARNING_RATE
+    assert settings["momentum"] == defaults.FINETUNING_MOMENTUM

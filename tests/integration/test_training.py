@@ -50,7 +50,7 @@ def trained_dbn(
     sampler: Any = None, *, chunk_size: int = 10_000, batch_size: int | None = None, **settings: Any
 ) -> DBN:
     dbn = DBN(7, [5, 3], weight_init=Gaussian(std=0.5))
-    module = DBNPretraining(dbn, sampler or Exact(), iterations=4)
+    module = DBNPretraining(dbn, sampler or Exact(), iterations=4, centring=None)
     fit(module, ImageDataModule(images(), batch_size=None, chunk_size=chunk_size), MomentumSchedule())
     return dbn
 
