@@ -2,9 +2,9 @@
 
     python experiments/from_scikit_learn/run.py
 
-prints the tables of docs/scikit_learn.md. Both classes have their default settings, but for the number of hidden units
-and of passes, which is the same, and the learning rate. That is chosen on held-out training images: by accuracy for
-features, by log-likelihood for the density. Test images decide nothing.
+prints the tables of docs/scikit_learn.md. Both classes have their default settings, but for the number of hidden
+units and of passes, which is the same, and the learning rate. That is chosen on held-out training images: by
+accuracy for features, by log-likelihood for the density. Test images decide nothing.
 """
 
 import time
