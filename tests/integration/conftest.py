@@ -1,5 +1,6 @@
 """Ways to run the command line: in this process where that is enough, as a real process where it is not."""
 
+import logging
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -30,9 +31,18 @@ def run_command(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[st
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else 1
         captured = capfd.readouterr()
+        _forget_log_handlers()
         return Outcome(status, captured.out, captured.err)
 
     return run
+
+
+def _forget_log_handlers() -> None:
+    """Take away Hydra's handlers, whose streams are those of this test."""
+    root = logging.getLogger()
+    for handler in [h for h in root.handlers if type(h) in (logging.StreamHandler, logging.FileHandler)]:
+        root.removeHandler(handler)
+        handler.close()
 
 
 @pytest.fixture

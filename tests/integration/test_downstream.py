@@ -25,7 +25,10 @@ HYDRA = "1.4.0rc3"
 OTHER_VERSIONS = r"hydra-.*|omegaconf|antlr4-.*|optuna"
 """What belongs to Hydra 1.3, with which all other tests run."""
 
-FAST = ["pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"]
+FAST = [
+    *("pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"),
+    *("pretrain.batch_size=null", "finetune.batch_size=100", "callbacks=minimal", "logger=none"),
+]
 
 
 def run(*command: str | Path, folder: Path, status: int = 0) -> str:
