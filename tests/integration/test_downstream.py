@@ -27,7 +27,7 @@ OTHER_VERSIONS = r"hydra-.*|omegaconf|antlr4-.*|optuna"
 
 FAST = [
     *("pretrain.iterations=2", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=5"),
-    *("pretrain.batch_size=null", "finetune.batch_size=100", "callbacks=minimal", "logger=none"),
+    *("preset=paper", "callbacks=minimal", "logger=none"),
 ]
 
 

@@ -550,7 +550,7 @@ def test_pretraining_in_mini_batches_does_more_updates():
     whole, parts = (
         classifier(pretrain_batch_size=size, pretrain_learning_rate=0.5).fit(X, label) for size in (None, 5)
     )
-    lengths = [float(made.network_[0][0].b.detach().norm()) for made in (whole, parts)]
+    lengths = [float(made.network_[0][0].c.detach().norm()) for made in (whole, parts)]
     assert lengths[1] > 2 * lengths[0] > 0
 
 

@@ -29,7 +29,7 @@ SMALL = [
     "solver.max_steps=20",
     "solver.n_restarts=3",
 ]
-SINGLE = [*QUIET, *[setting for setting in SMALL if not setting.startswith("figure")]]
+SINGLE = ["preset=paper", *QUIET, *[setting for setting in SMALL if not setting.startswith("figure")]]
 NO_CONTROLS = "figure/curves=none"
 
 
@@ -114,7 +114,7 @@ def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run, joblib_
     """As a user would ask Hydra for Fig. 4: samplers, pretraining lengths and seeds, by the joblib launcher."""
     single = ["data=digits", "finetune.iterations=2", "solver.max_steps=20", "solver.n_restarts=3"]
     sweep = ["-m", "sampler=cd,dmm_qubo", "pretrain.iterations=range(1,3)", "seed=range(2)"]
-    outcome = memcomp_train(*sweep, *single, *QUIET, *joblib_launcher, "hydra.sweep.dir=sweep")
+    outcome = memcomp_train(*sweep, "preset=paper", *single, *QUIET, *joblib_launcher, "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.err
     figure = [
         "experiment=figure4",
@@ -149,6 +149,7 @@ def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train:
     outcome = memcomp_train("experiment=figure4", *small, NO_CONTROLS, curve, *drop, "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     single = memcomp_train(
+        "preset=paper",
         *QUIET,
         *[o for o in small if not o.startswith("figure")],
         f"control={control}",

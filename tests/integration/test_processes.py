@@ -13,6 +13,7 @@ from running import HANGS_AFTER, THREADS
 
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [
+    "preset=paper",
     "sampler=ground_state",
     "solver=alternating_descent",
     "pretrain.iterations=4",

@@ -92,6 +92,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     assert memcomp_train(*SMALL).status == 0
     decay = "{_target_:memcomp_lightning.callbacks.LearningRateDecay,n_passes:40}"
     single = memcomp_train(
+        "preset=paper",
         "data=shifting_bars",
         "model.hidden_sizes=[18]",
         "sampler=exact",
