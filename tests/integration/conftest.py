@@ -1,17 +1,38 @@
 """Ways to run the command line: in this process where that is enough, as a real process where it is not."""
 
+import copy
 import logging
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from hydra.core.global_hydra import GlobalHydra
 from running import Outcome, launch
 
 import memcomp_lightning
 from memcomp_lightning.cli import report, solve, sweep, train
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _files_of_the_package_are_read_once() -> Iterator[None]:
+    """Keep our configuration files as Hydra reads them: each composition would parse some thirty again."""
+    read = ImportlibResourcesConfigSource.load_config
+    kept: dict[tuple[str, str], Any] = {}
+
+    def load_config(source: ImportlibResourcesConfigSource, config_path: str) -> Any:
+        key = (source.path, config_path)
+        if key not in kept:
+            kept[key] = read(source, config_path)
+        return copy.deepcopy(kept[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ImportlibResourcesConfigSource, "load_config", load_config)
+        yield
+
 
 RunCommand = Callable[[str, Callable[[], None], tuple[str, ...]], Outcome]
 
