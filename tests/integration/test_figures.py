@@ -16,6 +16,7 @@ from running import HANGS_AFTER, QUIET, Outcome
 from test_command_line import options
 
 from memcomp_lightning.cli import figures, report
+from memcomp_lightning.cli.commands import report as pages
 from memcomp_lightning.report import Records
 
 Run = Callable[..., Outcome]
@@ -42,9 +43,20 @@ def only(found: Records, curve: str, iterations: int) -> Any:
     return record
 
 
+@pytest.fixture
+def no_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Records alone: drawing pictures takes longer than training small networks."""
+
+    def write_page(arguments: list[str]) -> None:
+        Path(arguments[-1]).touch()
+
+    monkeypatch.setattr(pages, "main", write_page)
+
+
 SAMPLERS = [name for name in options("sampler") if name not in ("exact", "ground_state", "dwave_qpu")]
 
 
+@pytest.mark.usefixtures("no_pages")
 def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     """Every sampler; two lengths and two seeds in one tensor program, the last bits may differ."""
     curves = [f"+figure.curves.{name}={{label: {name}, overrides: ['sampler={name}']}}" for name in SAMPLERS]
@@ -78,6 +90,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
 
 
+@pytest.mark.usefixtures("no_pages")
 @pytest.mark.parametrize("place", ["--config-dir=confs", "hydra.searchpath=['file://confs']"])
 def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, place: str) -> None:
     """Beside one that has no solver, whose settings are common; it goes on without being told the place again."""
@@ -95,6 +108,7 @@ def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, pl
     assert only(records(), "mine", 2).scores["test_loss"] == losses
 
 
+@pytest.mark.usefixtures("no_pages")
 @pytest.mark.parametrize("sampler", ["cd", "pcd", "dmm_qubo"])
 def test_a_replica_trained_jointly_is_the_single_run(memcomp_train: Run, sampler: str) -> None:
     joint = ["pretrain=joint", f"sampler={sampler}", "positive.max_iterations=5"]
@@ -138,6 +152,7 @@ def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run, joblib_
         assert float(row["test_accuracy_error"]) == pytest.approx(float(point["standard_error"]), abs=1e-9)
 
 
+@pytest.mark.usefixtures("no_pages")
 @pytest.mark.parametrize("control", [name for name in options("control") if name != "exact"])
 def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train: Run, control: str) -> None:
     untrained = ("no_pretraining", "gaussian", "xavier_1", "xavier_4", "bn_relu", "bn_relu_regularised")

@@ -263,8 +263,9 @@ class GlobalSolver:
 
 class StreamlessSolver:
     def minimise(self, qubo, *, generator):
+        # Of many restarts, so that two answers are never the same by chance.
         generator.manual_seed(CALLS.append(0) or len(CALLS))
-        return AlternatingDescent(n_restarts=1).minimise(qubo, generator=generator)
+        return AlternatingDescent(n_restarts=16).minimise(qubo, generator=generator)
 
 
 def highest_state(solution, qubo):
