@@ -21,10 +21,10 @@ CENTRING_RATE = 0.01
 WEIGHT_STD = 0.01
 """Standard deviation of the first weights."""
 
-FINETUNING_PASSES = 100
+FINETUNING_PASSES = 50
 """Passes over the training set of back-propagation."""
 
-FINETUNING_LEARNING_RATE = 0.1
+FINETUNING_LEARNING_RATE = 0.2
 """Of back-propagation."""
 
 FINETUNING_MOMENTUM = 0.9

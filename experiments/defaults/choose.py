@@ -16,12 +16,29 @@ from memcomp_lightning.cli.units import Member, Unit, run_unit
 SPLITS = (100, 101, 102)
 """Seeds of runs and of splits into training and test images, others than those of the table that is reported."""
 
-PASSES = (20, 50, 100)
-SAMPLERS = ("cd", "pcd", "dmm_qubo", "quench")
+PASSES = (20, 30, 50, 100)
 RATES = {
     "rate 1": ["finetune.optimizer.lr=1.0", "finetune.optimizer.momentum=0.0"],
     "rate .1, momentum .9": ["finetune.optimizer.lr=0.1", "finetune.optimizer.momentum=0.9"],
+    "rate .2, momentum .9": [],
+    "rate .3, momentum .9": ["finetune.optimizer.lr=0.3", "finetune.optimizer.momentum=0.9"],
+    "rate 1, momentum .9": ["finetune.optimizer.lr=1.0", "finetune.optimizer.momentum=0.9"],
 }
+RUNS = {sampler: [f"sampler={sampler}"] for sampler in ("cd", "pcd", "dmm_qubo", "quench")}
+"""All rates are tried for these."""
+
+FURTHER_RUNS = {
+    "dmm_time_average, 4 restarts": ["sampler=dmm_time_average", "solver.n_restarts=4"],
+    "dmm_time_average, 8 restarts": ["sampler=dmm_time_average", "solver.n_restarts=8"],
+    "dmm_time_average, 28 restarts": ["sampler=dmm_time_average", "solver.n_restarts=28"],
+    "exact, 12 and 12 hidden units": ["sampler=exact", "model.hidden_sizes=[12,12]"],
+    "parallel_tempering": ["sampler=parallel_tempering"],
+    "mode_assisted_cd": ["sampler=mode_assisted_cd"],
+    "mode_assisted_pcd": ["sampler=mode_assisted_pcd"],
+    "annealer": ["sampler=annealer"],
+    "batch norm + ReLU": ["control=bn_relu"],
+}
+"""The chosen rate alone."""
 
 
 def accuracies(overrides: list[str]) -> list[list[float]]:
@@ -39,14 +56,16 @@ def accuracies(overrides: list[str]) -> list[list[float]]:
 def main() -> None:
     """Print the table."""
     torch.set_num_threads(1)
-    print(f"| sampler | fine-tuning | {' | '.join(f'{n} passes' for n in PASSES)} |")
+    tried = [(name, rate) for name in RUNS for rate in RATES]
+    tried += [(name, "rate .2, momentum .9") for name in FURTHER_RUNS]
+    print(f"| run | fine-tuning | {' | '.join(f'{n} passes' for n in PASSES)} |")
     print("| --- | --- |" + " --- |" * len(PASSES))
     with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
-        for sampler in SAMPLERS:
-            for name, overrides in RATES.items():
-                of_passes = zip(*accuracies([f"sampler={sampler}", *overrides]), strict=True)
-                means = [f"{statistics.mean(values):.3f}" for values in of_passes]
-                print(f"| {sampler} | {name} | {' | '.join(means)} |", flush=True)
+        for name, rate in tried:
+            overrides = (RUNS | FURTHER_RUNS)[name] + RATES[rate]
+            of_passes = zip(*accuracies(overrides), strict=True)
+            means = [f"{statistics.mean(values):.3f}" for values in of_passes]
+            print(f"| {name} | {rate} | {' | '.join(means)} |", flush=True)
 
 
 if __name__ == "__main__":

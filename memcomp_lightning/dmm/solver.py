@@ -337,11 +337,23 @@ def _select(problem: Qubo | WeightedMaxSat, chosen: Tensor) -> Qubo | WeightedMa
 
 def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -> Trajectory:
     """Add what the records weigh, from their states in float64, and how long each one stands."""
-    # One record of all restarts at a time: all at once would need memory for records x pairs.
-    energies = torch.stack([problem.energy(record) for record in states.unbind(2)], dim=-1)
+    n_problems, n_restarts = times.shape[:2]
+    n_terms = math.prod(problem.graph.edge_shape) + problem.n
+    if isinstance(problem, WeightedMaxSat):
+        n_terms += sum(block.variables.numel() for block in problem.longer)
+    # All records at once could need memory for records x terms.
+    block = max(1, _MOST_TERMS // (n_problems * n_restarts * n_terms))
+    energies = torch.cat(
+        [problem.energy(part.flatten(1, 2)).unflatten(-1, (n_restarts, -1)) for part in states.split(block, dim=2)],
+        dim=-1,
+    )
     offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
     dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
     return Trajectory(times, energies - offset[:, None, None], states, dwell)
+
+
+_MOST_TERMS = 2**22
+"""Terms of energies that are held at once: 32 MiB in float64."""
 
 
 def _join(parts: list[tuple[Tensor, slice, Tensor]], shape: tuple[int, int], elsewhere: float) -> Tensor:
