@@ -13,13 +13,14 @@ import lightning.pytorch as pl
 import torch
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import ProgressBar
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, MomentumSchedule, StageProgressBar
 from memcomp_lightning.cli.errors import UserError, in_words
 from memcomp_lightning.cli.hydra_versions import instantiate
+from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
@@ -103,9 +104,14 @@ def build(config: DictConfig) -> Plan:
         for name in config if group == "" else config[group]:
             require_choice(f"setting {group}".rstrip(), name, known)
     check_finite(config)
+    check_kinds(config)
     seed = config.seed
     check_seed(seed)
     precision_of(config.trainer.precision)
+    require_count("checkpoint_every", config.checkpoint_every)
+    for name, values in config.tried.items():
+        numbers = isinstance(values, ListConfig) and all(isinstance(x, int | float) for x in values)
+        require(numbers, f"tried.{name}", values, "a list of numbers")
     images = _loaded(instantiate(config.data.source))
     network = _network(config, images)
     for stage in ("pretrain", "finetune"):
@@ -113,7 +119,7 @@ def build(config: DictConfig) -> Plan:
     pretraining = finetuning = None
     if isinstance(network, DBN | BoltzmannMachine) and config.pretrain.iterations > 0:
         callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
-        centring = instantiate(config.pretrain.centring)
+        centring = _part(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         initial_bias = config.pretrain.initial_bias
@@ -171,7 +177,7 @@ def build(config: DictConfig) -> Plan:
         else:
             classifier = Classifier(network, **settings)
         finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
-    between = instantiate(config.between_stages) if isinstance(network, DBN) else None
+    between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between)
     require(
         bool(plan.stages),
@@ -180,6 +186,13 @@ def build(config: DictConfig) -> Plan:
         "an integer >= 1 where there is no pretraining",
     )
     return plan
+
+
+def _part(settings: Any, name: str) -> Any:
+    """What settings with a ``_target_`` stand for; None for null."""
+    named = settings is None or (isinstance(settings, DictConfig) and "_target_" in settings)
+    require(named, name, settings, "null, or settings by name with a _target_")
+    return instantiate(settings)
 
 
 def _check_module(make: Any, network: nn.Module) -> None:

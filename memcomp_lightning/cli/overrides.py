@@ -230,7 +230,10 @@ def _of_another_kind(config_name: str, job: Sequence[str], paths: Sequence[str])
             return f"{name} = {value!r} is not allowed: expected a list. Write {name}=[{text.strip('()')}]"
         if isinstance(before, DictConfig) and not isinstance(value, dict | NoneType):
             known = ", ".join(f"{name}.{key!s}" for key in before)
-            return f"{name} = {value!r} is not allowed: expected settings by name. Known here: {known}."
+            group = name.replace(".", "/")
+            options = GlobalHydra.instance().config_loader().get_group_options(group)
+            choice = f"Choose with {group}=NAME: {', '.join(options)}. " if options else ""
+            return f"{name} = {value!r} is not allowed: expected settings by name. {choice}Known here: {known}."
     return None
 
 

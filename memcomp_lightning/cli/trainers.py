@@ -153,7 +153,6 @@ def _make(
         # Lightning's own report of these goes to a log that is not shown.
         kind = f"lightning.pytorch.profilers.{settings['profiler'].capitalize()}Profiler"
         settings["profiler"] = {"_target_": kind, "dirpath": str(folder), "filename": "profile"}
-    require_count("checkpoint_every", config.checkpoint_every)
     make = instantiate(settings, _partial_=True, _convert_="all")
     trainer: pl.Trainer = make(
         max_epochs=max_epochs,

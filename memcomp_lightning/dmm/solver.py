@@ -90,6 +90,12 @@ class DmmSolver:
     def __post_init__(self) -> None:
         parts = ("integrator", "noise", "spread", "build", "stability", "init", "derivative", "bound")
         require_parts("field", self.field, "vector field", parts)
+        if self.integrator is not None:
+            require_parts("integrator", self.integrator, "integrator", ("step",))
+        if self.warm is not None:
+            require_parts("warm", self.warm, "WarmRestart", ("keep", "spread"))
+        if self.record is not None:
+            require_parts("record", self.record, "Recording", ("every",))
         require_count("n_restarts", self.n_restarts)
         for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
             if getattr(self, name) is not None:
@@ -343,10 +349,8 @@ def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -
         n_terms += sum(block.variables.numel() for block in problem.longer)
     # All records at once could need memory for records x terms.
     block = max(1, _MOST_TERMS // (n_problems * n_restarts * n_terms))
-    energies = torch.cat(
-        [problem.energy(part.flatten(1, 2)).unflatten(-1, (n_restarts, -1)) for part in states.split(block, dim=2)],
-        dim=-1,
-    )
+    parts = (problem.energy(part.flatten(1, 2)) for part in states.split(block, dim=2))
+    energies = torch.cat([part.unflatten(-1, (n_restarts, -1)) for part in parts], dim=-1)
     offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
     dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
     return Trajectory(times, energies - offset[:, None, None], states, dwell)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.models import RBM, BoltzmannMachine
 from memcomp_lightning.qubo import Qubo, QuboSolution, Status, from_model
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -66,11 +66,19 @@ def from_bqm(bqm: BinaryQuadraticModel) -> tuple[Qubo, list[Any]]:
 
 
 def _answer(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: Generator) -> Any:
-    """The sample set of one problem."""
+    """The sample set of one problem.
+
+    Raises:
+        SettingError: The sampler does not take the parameters.
+    """
     given = dict(parameters)
     if "seed" in sampler.parameters and "seed" not in given:
         given["seed"] = int(torch.randint(2**31, (), generator=generator, device=generator.device))
-    return sampler.sample(to_bqm(qubo), **given)
+    try:
+        return sampler.sample(to_bqm(qubo), **given)
+    except (TypeError, ValueError) as error:
+        kind = type(sampler).__name__
+        raise SettingError(f"parameters = {dict(parameters)} does not suit {kind}.sample: {error}") from error
 
 
 def _reads(answer: Any, qubo: Qubo) -> Tensor:

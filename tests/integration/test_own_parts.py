@@ -47,14 +47,14 @@ def test_a_folder_of_configurations_is_there_and_has_names_of_its_own(memcomp_tr
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["pretrain.optimizer.lr=abc"], "pretrain.optimizer: text is given where a number is expected."),
+        (["pretrain.optimizer.lr=abc"], "pretrain.optimizer.lr = 'abc' is not allowed: expected a number."),
         (
             ["data.source.pixels=threshold", "data.source.threshold=abc"],
-            "data.source: text is given where a number",
+            "data.source.threshold = 'abc' is not allowed: expected a number.",
         ),
         (
             ["sampler=dmm_qubo", "solver.field=bond"],
-            "solver.field = 'bond' is not allowed: expected settings by name",
+            "expected settings by name. Choose with solver/field=NAME: bond, clause. Known here: ",
         ),
         (
             ["sampler=mode_assisted_cd", "sampler.inner=cd"],

@@ -17,6 +17,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.cli.arguments import read
 from memcomp_lightning.cli.errors import UserError, refuse
 from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
+from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.output import make_tolerant, say
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, check_finite, check_seed
 from memcomp_lightning.cli.table import short_path
@@ -77,6 +78,7 @@ def prepare(config: DictConfig) -> tuple[Problem, QuboSolver]:
     for name in config:
         require_choice("setting", name, _SETTINGS)
     check_finite(config)
+    check_kinds(config)
     check_seed(config.seed)
     require(isinstance(config.maximise, bool), "maximise", config.maximise, "true or false")
     if not config.problem:

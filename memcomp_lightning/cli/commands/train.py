@@ -28,7 +28,7 @@ from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.cli.trainers import check_trainers
-from memcomp_lightning.errors import SettingError, require
+from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.modules import CheckpointError, DivergedError
 
 COMMAND = "memcomp-train"
@@ -82,6 +82,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
             )
     values = tried_values(config)
     n_passes = config.finetune.iterations
+    require_count("finetune.iterations", n_passes, minimum=0)
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
     check_trainers(plans[0], config)
