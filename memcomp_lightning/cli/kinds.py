@@ -4,6 +4,7 @@ import inspect
 import types
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cache
 from os import PathLike
 from typing import Any, Literal
 
@@ -52,6 +53,7 @@ def _parts(value: Any, name: str) -> list[tuple[DictConfig, str]]:
     return []
 
 
+@cache
 def _hints(target: object) -> dict[str, Any]:
     """The annotated arguments of a target; none of what is not ours to judge, or is not there."""
     if not isinstance(target, str) or not target.startswith(_CHECKED):

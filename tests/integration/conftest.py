@@ -1,7 +1,7 @@
 """Ways to run the command line: in this process where that is enough, as a real process where it is not."""
 
-import copy
 import logging
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -9,44 +9,45 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra._internal.config_repository import ConfigRepository
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
-from hydra.plugins.config_source import ConfigResult
+from hydra.core.utils import JobRuntime
+from omegaconf import DictConfig
 from running import Outcome, launch
 
 import memcomp_lightning
 from memcomp_lightning.cli import report, solve, sweep, train
 
+OURS = [("pkg", "hydra.conf"), ("pkg", "memcomp_lightning.conf"), ("structured", "")]
+"""Sources of configurations that no test changes."""
+
 
 @pytest.fixture(scope="session", autouse=True)
-def _compositions_are_quick() -> Iterator[None]:
-    """Read our configuration files once, and look for a mode where one is set: it takes half the time.
+def _composed_once() -> Iterator[None]:
+    """Keep what Hydra composes of our own files: some thousand times a quarter of a second."""
+    compose, get_mode = ConfigLoaderImpl._load_configuration_impl, Hydra.get_mode
+    kept: dict[tuple[Any, ...], bytes] = {}
 
-    Composing copies what goes into a package of its own, and changes the rest.
-    """
-    read, get_mode = ConfigRepository.load_config, Hydra.get_mode
-    kept: dict[str, ConfigResult | None] = {}
-
-    def load_config(repository: ConfigRepository, config_path: str) -> ConfigResult | None:
-        source = repository._find_object_source(config_path, ObjectType.CONFIG)
-        if source is None or f"{source.scheme()}://{source.path}" != "pkg://memcomp_lightning.conf":
-            return read(repository, config_path)
-        if config_path not in kept:
-            kept[config_path] = read(repository, config_path)
-        result = copy.copy(kept[config_path])
-        if result is not None:
-            result.defaults_list = copy.deepcopy(result.defaults_list)
-            if "/" not in config_path or result.header.get("package") == "_global_":  # merged as it is
-                result.config = copy.deepcopy(result.config)
-        return result
+    def composed(
+        loader: ConfigLoaderImpl, config_name: str | None, overrides: list[str], *args: Any, **kwargs: Any
+    ) -> DictConfig:
+        sources = sorted((source.scheme(), source.path) for source in loader.repository.get_sources())
+        if sources != OURS or any("hydra.searchpath" in override for override in overrides):
+            return compose(loader, config_name, overrides, *args, **kwargs)
+        key = (config_name, *overrides, args, *kwargs.items(), JobRuntime.instance().conf.name)
+        if key not in kept:
+            kept[key] = pickle.dumps(compose(loader, config_name, overrides, *args, **kwargs))
+        config: DictConfig = pickle.loads(kept[key])
+        config.hydra.runtime.cwd = str(Path.cwd())
+        return config
 
     def mode(hydra: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+        """Of the command line: composed again only where it may be set."""
         return get_mode(hydra, config_name, overrides) if any("hydra.mode" in o for o in overrides) else None
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConfigRepository, "load_config", load_config)
+        patch.setattr(ConfigLoaderImpl, "_load_configuration_impl", composed)
         patch.setattr(Hydra, "get_mode", mode)
         yield
 
