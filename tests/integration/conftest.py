@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
 from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import JobRuntime
@@ -25,9 +26,16 @@ OURS = [("pkg", "hydra.conf"), ("pkg", "memcomp_lightning.conf"), ("structured",
 
 @pytest.fixture(scope="session", autouse=True)
 def _composed_once() -> Iterator[None]:
-    """Keep what Hydra composes of our own files: some thousand times a quarter of a second."""
+    """Keep what Hydra reads and composes of our own files: some thousand times a quarter of a second."""
     compose, get_mode = ConfigLoaderImpl._load_configuration_impl, Hydra.get_mode
+    read = ImportlibResourcesConfigSource.load_config
     kept: dict[tuple[Any, ...], bytes] = {}
+
+    def load_config(source: ImportlibResourcesConfigSource, config_path: str) -> Any:
+        key = (source.path, config_path)
+        if key not in kept:
+            kept[key] = pickle.dumps(read(source, config_path))
+        return pickle.loads(kept[key])
 
     def composed(
         loader: ConfigLoaderImpl, config_name: str | None, overrides: list[str], *args: Any, **kwargs: Any
@@ -48,6 +56,7 @@ def _composed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigLoaderImpl, "_load_configuration_impl", composed)
+        patch.setattr(ImportlibResourcesConfigSource, "load_config", load_config)
         patch.setattr(Hydra, "get_mode", mode)
         yield
 
