@@ -5,10 +5,10 @@ import types
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
+from importlib import import_module
 from os import PathLike
 from typing import Any, Literal
 
-from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import Tensor
 
@@ -59,7 +59,8 @@ def _hints(target: object) -> dict[str, Any]:
     if not isinstance(target, str) or not target.startswith(_CHECKED):
         return {}
     try:
-        made = get_object(target)
+        module, _, name = target.rpartition(".")
+        made = getattr(import_module(module), name)
         makers = (made.__init__, made.__new__) if inspect.isclass(made) else (made,)
         hints = next(filter(None, map(typing.get_type_hints, makers)), {})
     except Exception:  # the constructor's own failure has a better message

@@ -55,7 +55,7 @@ def test_samplers_draw_the_same_on_both_devices(sampler, device: str) -> None:
     "solver",
     [
         AlternatingDescent(),
-        DmmSolver(n_restarts=8, patience=7, max_steps=101, record=Recording()),
+        DmmSolver(n_restarts=8, patience=7, max_steps=41, record=Recording()),
         DmmSolver(patience=7, max_steps=101, quench_every=0, warm=WarmRestart()),
         DmmSolver(field=BondField(), max_steps=101),
     ],
@@ -70,7 +70,7 @@ def test_solvers_find_the_optimum_on_the_device(solver, device: str) -> None:
         torch.testing.assert_close(solution.best_energy, exact, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("n_steps", [100, 400])
+@pytest.mark.parametrize("n_steps", [50, 150])
 def test_the_host_runs_ahead_of_the_solver(n_steps: int, device: str) -> None:
     """Steps are never waited for: a quench is, once, and each eighth time whether all restarts are done."""
     if device != stand_in.NAME:

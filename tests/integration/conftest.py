@@ -14,7 +14,7 @@ from hydra._internal.core_plugins.importlib_resources_config_source import Impor
 from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import JobRuntime
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from running import Outcome, launch
 
 import memcomp_lightning
@@ -47,6 +47,7 @@ def _composed_once() -> Iterator[None]:
         if key not in kept:
             kept[key] = pickle.dumps(compose(loader, config_name, overrides, *args, **kwargs))
         config: DictConfig = pickle.loads(kept[key])
+        OmegaConf.clear_cache(config)  # which time it was
         config.hydra.runtime.cwd = str(Path.cwd())
         return config
 

@@ -261,7 +261,7 @@ KINDS = {
     "model.hidden_sizes=16": "Write model.hidden_sizes=[16]",
     "callbacks.finetune=3": "callbacks.finetune = 3 is not allowed: expected settings by name",
     "pretrain.optimizer=sgd": "pretrain.optimizer._target_",
-    "trainer.fast_dev_run=yes": "trainer.fast_dev_run=yes: ",
+    "trainer.fast_dev_run=yes": "trainer.fast_dev_run = 'yes' is not allowed: expected an integer, or true",
     "pretrain.iterations=1e3": "pretrain.iterations = 1000.0 is not allowed: expected an integer >= 0. Write 1000",
     "seed=[1]": "seed = [1] is not allowed: expected an integer",
     "~pretrain.iterations": "setting pretrain.iterations is missing",

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from running import HANGS_AFTER, THREADS
+from running import HANGS_AFTER, THREADS, Outcome
 
+Run = Callable[..., Outcome]
 Start = Callable[..., "subprocess.Popen[str]"]
 RUN = [
     "preset=paper",
@@ -23,10 +24,9 @@ RUN = [
 ]
 
 
-def test_two_processes_give_the_update_of_one(start_process: Start, tmp_path: Path) -> None:
-    one = start_process(*RUN, "hydra.run.dir=one")
-    _, err = one.communicate()
-    assert one.returncode == 0, err
+def test_two_processes_give_the_update_of_one(memcomp_train: Run, start_process: Start, tmp_path: Path) -> None:
+    one = memcomp_train(*RUN, "hydra.run.dir=one")
+    assert one.status == 0, one.err
     distributed = ["trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300"]
     two = start_process(*RUN, "hydra.run.dir=two", *distributed)
     out, err = two.communicate(timeout=HANGS_AFTER)
