@@ -5,10 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from joblib import Memory
 from numpy.typing import NDArray
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.linear_model import LogisticRegression
 from torch import Tensor
 
 from memcomp_lightning.data.mnist_files import cache_folder
@@ -35,6 +32,8 @@ def logistic_regression(train: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor
     Returns:
         Share of the test images whose label is predicted.
     """
+    from joblib import Memory  # with scikit-learn half a second, which not every command needs
+
     n = n_fitted(train[0])
     arrays = [tensor.numpy(force=True) for tensor in (train[0][:n], train[1][:n], *test)]
     try:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
@@ -60,6 +61,12 @@ def _composed_once() -> Iterator[None]:
         patch.setattr(ImportlibResourcesConfigSource, "load_config", load_config)
         patch.setattr(Hydra, "get_mode", mode)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _shapes_unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exact and unit tests check them; here they would take a sixth of the time."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 RunCommand = Callable[[str, Callable[[], None], tuple[str, ...]], Outcome]
