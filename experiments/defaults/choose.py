@@ -32,6 +32,8 @@ FURTHER_RUNS = {
     "dmm_time_average, 8 restarts": ["sampler=dmm_time_average", "solver.n_restarts=8"],
     "dmm_time_average, 28 restarts": ["sampler=dmm_time_average", "solver.n_restarts=28"],
     "exact, 12 and 12 hidden units": ["sampler=exact", "model.hidden_sizes=[12,12]"],
+    "exact, 12 and 32 hidden units": ["sampler=exact", "model.hidden_sizes=[12,32]"],
+    "exact, 12 and 64 hidden units": ["sampler=exact", "model.hidden_sizes=[12,64]"],
     "parallel_tempering": ["sampler=parallel_tempering"],
     "mode_assisted_cd": ["sampler=mode_assisted_cd"],
     "mode_assisted_pcd": ["sampler=mode_assisted_pcd"],

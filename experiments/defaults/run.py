@@ -18,7 +18,7 @@ RUNS = {
     "cd": ["sampler=cd"],
     "pcd": ["sampler=pcd"],
     "parallel_tempering": ["sampler=parallel_tempering"],
-    "exact, 12 and 12 hidden units": ["sampler=exact", "model.hidden_sizes=[12,12]"],
+    "exact, 12 and 32 hidden units": ["sampler=exact", "model.hidden_sizes=[12,32]"],
     "dmm_qubo": ["sampler=dmm_qubo"],
     "dmm_time_average": ["sampler=dmm_time_average"],
     "ground_state": ["sampler=ground_state"],

@@ -20,6 +20,7 @@ from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.table import final_log_likelihoods
+from memcomp_lightning.cli.threads import threads_for
 from memcomp_lightning.cli.trainers import trainer_of
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.models import DBN
@@ -62,7 +63,8 @@ def run(
             if stage is plan.pretraining:
                 _between(plan, config)
             continue
-        trainer = _fit(stage, config, folder, loggers)
+        with threads_for(stage, config):
+            trainer = _fit(stage, config, folder, loggers)
         is_global_zero = trainer.is_global_zero
         records[name] = _record(stage)
         if is_global_zero and not config.trainer.fast_dev_run:

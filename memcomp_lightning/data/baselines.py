@@ -63,6 +63,9 @@ def independent_log_likelihood(train_v: Tensor, v: Tensor) -> float:
 def _fit_and_score(
     train_v: NDArray[Any], train_label: NDArray[Any], test_v: NDArray[Any], test_label: NDArray[Any]
 ) -> float:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.linear_model import LogisticRegression
+
     if len(np.unique(train_label)) == 1:
         return float((test_label == train_label[0]).mean())
     with warnings.catch_warnings():

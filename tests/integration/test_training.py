@@ -1,11 +1,13 @@
 """The modules inside a Trainer, without the command line."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import lightning.pytorch as pl
 import pytest
 import torch
+from running import FAST, Outcome
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import MomentumSchedule
@@ -13,6 +15,8 @@ from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, Shif
 from memcomp_lightning.models import DBN, Gaussian
 from memcomp_lightning.modules import BaselineClassifier, DBNClassifier, DBNPretraining, StageModule, evaluate
 from memcomp_lightning.samplers import CD, PCD, Exact
+
+Run = Callable[..., Outcome]
 
 
 def images(n: int = 101, n_visible: int = 7, n_classes: int = 3) -> ImageData:
@@ -183,3 +187,19 @@ def test_replicas_learn_as_they_would_alone() -> None:
     fit(DBNPretraining(alone, Exact(), iterations=3), ImageDataModule(part, batch_size=None))
     for name, tensor in alone.state_dict().items():
         torch.testing.assert_close(both.state_dict()[name][1], tensor, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("hidden", "given", "n_threads"), [(5, None, 1), (3000, None, 3), (5, "3", 3)])
+def test_small_updates_take_one_thread(
+    memcomp_train: Run, monkeypatch: pytest.MonkeyPatch, hidden: int, given: str | None, n_threads: int
+) -> None:
+    """Those who train side by side are in each other's way otherwise; what somebody sets stands."""
+    seen = set()
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    monkeypatch.setattr(torch, "set_num_threads", seen.add)
+    outcome = memcomp_train(*FAST, "sampler=cd", f"model.hidden_sizes=[{hidden}]", "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert seen == {n_threads, 3}
