@@ -61,7 +61,7 @@ def main() -> None:
     for seed in range(arguments.seeds):
         for name, overrides in RUNS.items():
             if not any(row["run"] == name and int(row["seed"]) == seed for row in rows):
-                rows.append({"run": name, "seed": seed, **run(overrides, seed)})
+                rows.append({"run": name, "seed": str(seed), **run(overrides, seed)})
                 print(rows[-1], flush=True)
                 with arguments.results.open("w", newline="") as file:
                     writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")

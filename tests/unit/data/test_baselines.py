@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from sklearn import linear_model
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import baselines, independent_log_likelihood, logistic_regression
@@ -38,7 +39,7 @@ def test_the_second_time_nothing_is_fitted(monkeypatch: pytest.MonkeyPatch) -> N
     def refuse(*arguments: object, **settings: object) -> None:
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr(baselines, "LogisticRegression", refuse)
+    monkeypatch.setattr(linear_model, "LogisticRegression", refuse)
     assert logistic_regression(train, test) == 1.0
     with pytest.raises(AssertionError, match="fitted again"):
         logistic_regression(separable(42), test)
