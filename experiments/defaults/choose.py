@@ -20,7 +20,7 @@ PASSES = (20, 30, 50, 100)
 RATES = {
     "rate 1": ["finetune.optimizer.lr=1.0", "finetune.optimizer.momentum=0.0"],
     "rate .1, momentum .9": ["finetune.optimizer.lr=0.1", "finetune.optimizer.momentum=0.9"],
-    "rate .2, momentum .9": [],
+    "rate .2, momentum .9": ["finetune.optimizer.lr=0.2", "finetune.optimizer.momentum=0.9"],
     "rate .3, momentum .9": ["finetune.optimizer.lr=0.3", "finetune.optimizer.momentum=0.9"],
     "rate 1, momentum .9": ["finetune.optimizer.lr=1.0", "finetune.optimizer.momentum=0.9"],
 }

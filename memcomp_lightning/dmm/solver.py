@@ -92,10 +92,6 @@ class DmmSolver:
         require_parts("field", self.field, "vector field", parts)
         if self.integrator is not None:
             require_parts("integrator", self.integrator, "integrator", ("step",))
-        if self.warm is not None:
-            require_parts("warm", self.warm, "WarmRestart", ("keep", "spread"))
-        if self.record is not None:
-            require_parts("record", self.record, "Recording", ("every",))
         require_count("n_restarts", self.n_restarts)
         for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
             if getattr(self, name) is not None:
@@ -110,6 +106,7 @@ class DmmSolver:
                 f"an integer from 1 to n_restarts = {self.n_restarts}, or null",
             )
         if self.warm is not None:
+            require_parts("warm", self.warm, "WarmRestart", ("keep", "spread"))
             require(
                 self.patience is not None and self.n_restarts % self.patience == 0,
                 "warm",
@@ -118,6 +115,7 @@ class DmmSolver:
                 f"Set patience (now {self.patience}): so many restarts run at a time, later ones go on from them.",
             )
         if self.record is not None:
+            require_parts("record", self.record, "Recording", ("every",))
             require_count("record.every", self.record.every)
             if self.max_steps is not None:
                 require(
