@@ -53,7 +53,7 @@ def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictC
     """The figures of a run by their folders, each with its configuration and overrides."""
     if "all" not in config.figure:
         return {".": (config, list(overrides))}
-    others = [o for o in overrides if o.partition("=")[0] != "experiment"]
+    others = [o for o in overrides if o.lstrip("+").partition("=")[0] not in ("experiment", "figure.all")]
     own = {name: [f"experiment={name}", *others] for name in config.figure.all}
     return {name: (compose("config", some), some) for name, some in own.items()}
 

@@ -11,12 +11,12 @@ from typing import Any
 import jaxtyping
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import JobRuntime
 from omegaconf import DictConfig, OmegaConf
-from running import Outcome, launch
+from running import Outcome, Program, end_warm_python, launch
 
 import memcomp_lightning
 from memcomp_lightning.cli import report, solve, sweep, train
@@ -29,13 +29,16 @@ OURS = [("pkg", "hydra.conf"), ("pkg", "memcomp_lightning.conf"), ("structured",
 def _composed_once() -> Iterator[None]:
     """Keep what Hydra reads and composes of our own files: some thousand times a quarter of a second."""
     compose, get_mode = ConfigLoaderImpl._load_configuration_impl, Hydra.get_mode
-    read = ImportlibResourcesConfigSource.load_config
+    read = ConfigRepository.load_config
     kept: dict[tuple[Any, ...], bytes] = {}
 
-    def load_config(source: ImportlibResourcesConfigSource, config_path: str) -> Any:
-        key = (source.path, config_path)
+    def load_config(repository: ConfigRepository, config_path: str) -> Any:
+        sources = sorted((source.scheme(), source.path) for source in repository.get_sources())
+        if sources != OURS:
+            return read(repository, config_path)
+        key = ("file", config_path)
         if key not in kept:
-            kept[key] = pickle.dumps(read(source, config_path))
+            kept[key] = pickle.dumps(read(repository, config_path))
         return pickle.loads(kept[key])
 
     def composed(
@@ -58,9 +61,15 @@ def _composed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigLoaderImpl, "_load_configuration_impl", composed)
-        patch.setattr(ImportlibResourcesConfigSource, "load_config", load_config)
+        patch.setattr(ConfigRepository, "load_config", load_config)
         patch.setattr(Hydra, "get_mode", mode)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_process_is_left() -> Iterator[None]:
+    yield
+    end_warm_python()
 
 
 @pytest.fixture(autouse=True)
@@ -120,10 +129,10 @@ def memcomp_report(run_command: RunCommand) -> Callable[..., Outcome]:
 
 
 @pytest.fixture
-def start_process(tmp_path: Path) -> Callable[..., "subprocess.Popen[str]"]:
+def start_process(tmp_path: Path) -> Callable[..., Program]:
     """Start ``memcomp-train`` in the test's folder."""
 
-    def start(*arguments: str) -> "subprocess.Popen[str]":
+    def start(*arguments: str) -> Program:
         return launch(*arguments, folder=tmp_path)
 
     return start

@@ -1,12 +1,18 @@
 """What the integration tests share: quick settings, the outcome of a run, real processes."""
 
+import functools
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 THREADS = os.environ.get("MEMCOMP_THREADS", "1")
 """Of every process, as in this one: the last bits depend on their number."""
@@ -32,6 +38,10 @@ MOCK_QPU = (
 )
 
 
+WARM = [f"memcomp_lightning.cli.{name}" for name in ("train", "commands.train", "commands.solve")]
+"""What a program need not import again, with all that these import."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     status: int
@@ -39,15 +49,68 @@ class Outcome:
     err: str
 
 
-def launch(*arguments: str, folder: Path, command: str = "train") -> "subprocess.Popen[str]":
-    """Start a command as a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", f"memcomp_lightning.cli.{command}", *arguments],
-        cwd=folder,
+class Program:
+    """A running program, to be used like ``subprocess.Popen``."""
+
+    def __init__(self, arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
+        (self.stdout, out), (self.stderr, err), (self._told, tell) = _pipe(), _pipe(), _pipe()
+        message = json.dumps((list(arguments), str(folder), dict(environment))).encode()
+        with Path(os.devnull).open() as nothing:
+            socket.send_fds(_warm_python()[0], [message], [nothing.fileno(), out, err, tell])
+        for descriptor in (out, err, tell):
+            os.close(descriptor)
+        self.pid = int(self._told.readline())
+        self.returncode: int | None = None
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def communicate(self, timeout: float = HANGS_AFTER) -> tuple[str, str]:
+        """Wait for its end; return what it wrote."""
+        give_up = threading.Timer(timeout, self.send_signal, [signal.SIGKILL])
+        give_up.start()
+        try:
+            with ThreadPoolExecutor() as pool:
+                out, err = pool.map(lambda stream: stream.read(), (self.stdout, self.stderr))
+            self.returncode = int(self._told.readline())
+        finally:
+            give_up.cancel()
+            for stream in (self.stdout, self.stderr, self._told):
+                stream.close()
+        return out, err
+
+
+def _pipe() -> tuple[TextIO, int]:
+    read, write = os.pipe()
+    return os.fdopen(read), write
+
+
+@functools.cache
+def _warm_python() -> "tuple[socket.socket, subprocess.Popen[bytes]]":
+    """Where programs are asked for, and the process that starts them."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    script = Path(__file__).with_name("warm.py")
+    process = subprocess.Popen(
+        [sys.executable, script, str(theirs.fileno()), *WARM],
         env={**os.environ, "OMP_NUM_THREADS": THREADS},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # Ctrl-C stops the process even where the shell of these tests runs them in the background.
-        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
+        pass_fds=[theirs.fileno()],
     )
+    theirs.close()
+    return ours, process
+
+
+def end_warm_python() -> None:
+    if _warm_python.cache_info().currsize:
+        ours, process = _warm_python()
+        ours.close()
+        process.wait()
+
+
+def python(*arguments: str, folder: Path, **environment: str) -> Program:
+    """Start ``python ARGUMENTS``; torch, Lightning and this package are imported already."""
+    return Program(arguments, folder, {**os.environ, "OMP_NUM_THREADS": THREADS, **environment})
+
+
+def launch(*arguments: str, folder: Path, command: str = "train") -> Program:
+    """Start a command as a process of its own."""
+    return python("-m", f"memcomp_lightning.cli.{command}", *arguments, folder=folder)

@@ -1,18 +1,15 @@
 """Two real processes do the full-batch update of one."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from running import HANGS_AFTER, THREADS, Outcome
+from running import Outcome, Program, python
 
 Run = Callable[..., Outcome]
-Start = Callable[..., "subprocess.Popen[str]"]
+Start = Callable[..., Program]
 RUN = [
     "preset=paper",
     "sampler=ground_state",
@@ -29,7 +26,7 @@ def test_two_processes_give_the_update_of_one(memcomp_train: Run, start_process:
     assert one.status == 0, one.err
     distributed = ["trainer.devices=2", "trainer.strategy=ddp", "data.chunk_size=300"]
     two = start_process(*RUN, "hydra.run.dir=two", *distributed)
-    out, err = two.communicate(timeout=HANGS_AFTER)
+    out, err = two.communicate()
     assert two.returncode == 0, err
     for stage in ("pretrain", "finetune"):
         expected = torch.load(tmp_path / "one/weights" / f"{stage}.pt", weights_only=True)
@@ -100,14 +97,8 @@ if trainer.is_global_zero:
           "own streams:", not streams[0].equal(streams[1]))
 """
     )
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=HANGS_AFTER,
-        env={**os.environ, "OMP_NUM_THREADS": THREADS},
-    )
-    assert done.returncode == 0, done.stderr
-    assert "calls of a shared sampler: [3, 0]" in done.stdout, "one answer an update serves both processes"
-    assert "resumed to the same bits: True own chains: True own streams: True" in done.stdout
+    process = python(str(script), folder=tmp_path)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert "calls of a shared sampler: [3, 0]" in out, "one answer an update serves both processes"
+    assert "resumed to the same bits: True own chains: True own streams: True" in out

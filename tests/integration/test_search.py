@@ -13,7 +13,7 @@ from textwrap import dedent
 import pytest
 import yaml
 from omegaconf import OmegaConf
-from running import FAST, Outcome
+from running import FAST, Outcome, Program
 
 from memcomp_lightning.cli.hydra_versions import IS_1_3
 
@@ -84,7 +84,7 @@ def test_a_storage_that_optuna_cannot_use_is_refused(memcomp_train: Run) -> None
     assert "hydra.sweeper.storage = 'sqlite:///study.db' is not allowed: optuna 2" in outcome.err
 
 
-def test_local_submitit_launcher(start_process: Callable[..., "subprocess.Popen[str]"], tmp_path: Path) -> None:
+def test_local_submitit_launcher(start_process: Callable[..., Program], tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     own = ["hydra/launcher=submitit_local", "hydra.sweep.dir=sweep"]
     out, errors = start_process("-m", "sampler=cd", "seed=0,1", "callbacks=minimal", *FAST, *own).communicate()

@@ -248,7 +248,6 @@ def test_as_a_process_with_ctrl_c(tmp_path: Path) -> None:
     process = launch(
         "problem=ring.txt", "solver=dmm", "solver.max_steps=10000000", folder=tmp_path, command="solve"
     )
-    assert process.stdout is not None
     assert process.stdout.readline().startswith("ring: 5 variables, 5 couplings")
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
