@@ -16,7 +16,7 @@ from hydra._internal.hydra import Hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import JobRuntime
 from omegaconf import DictConfig, OmegaConf
-from running import Outcome, Program, end_warm_python, launch
+from running import Outcome, Program, end_warm_pythons, launch
 
 import memcomp_lightning
 from memcomp_lightning.cli import report, solve, sweep, train
@@ -69,7 +69,7 @@ def _composed_once() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _no_process_is_left() -> Iterator[None]:
     yield
-    end_warm_python()
+    end_warm_pythons()
 
 
 @pytest.fixture(autouse=True)

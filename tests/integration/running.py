@@ -1,6 +1,5 @@
 """What the integration tests share: quick settings, the outcome of a run, real processes."""
 
-import functools
 import json
 import os
 import signal
@@ -39,7 +38,7 @@ MOCK_QPU = (
 
 
 WARM = [f"memcomp_lightning.cli.{name}" for name in ("train", "commands.train", "commands.solve")]
-"""What a program need not import again, with all that these import."""
+"""What a program need not import again, with all that these import: most of the time of a short one."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +51,17 @@ class Outcome:
 class Program:
     """A running program, to be used like ``subprocess.Popen``."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        folder: Path,
+        environment: Mapping[str, str],
+        interpreter: str = sys.executable,
+    ) -> None:
         (self.stdout, out), (self.stderr, err), (self._told, tell) = _pipe(), _pipe(), _pipe()
         message = json.dumps((list(arguments), str(folder), dict(environment))).encode()
         with Path(os.devnull).open() as nothing:
-            socket.send_fds(_warm_python()[0], [message], [nothing.fileno(), out, err, tell])
+            socket.send_fds(_warm_python(interpreter), [message], [nothing.fileno(), out, err, tell])
         for descriptor in (out, err, tell):
             os.close(descriptor)
         self.pid = int(self._told.readline())
@@ -85,23 +90,28 @@ def _pipe() -> tuple[TextIO, int]:
     return os.fdopen(read), write
 
 
-@functools.cache
-def _warm_python() -> "tuple[socket.socket, subprocess.Popen[bytes]]":
-    """Where programs are asked for, and the process that starts them."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    script = Path(__file__).with_name("warm.py")
-    process = subprocess.Popen(
-        [sys.executable, script, str(theirs.fileno()), *WARM],
-        env={**os.environ, "OMP_NUM_THREADS": THREADS},
-        pass_fds=[theirs.fileno()],
-    )
-    theirs.close()
-    return ours, process
+_warm: "dict[str, tuple[socket.socket, subprocess.Popen[bytes]]]" = {}
+"""Of each interpreter, where programs are asked for, and the process that starts them."""
 
 
-def end_warm_python() -> None:
-    if _warm_python.cache_info().currsize:
-        ours, process = _warm_python()
+def _warm_python(interpreter: str) -> socket.socket:
+    if interpreter not in _warm:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        script = Path(__file__).with_name("warm.py")
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+        process = subprocess.Popen(
+            [interpreter, script, str(theirs.fileno()), *WARM],
+            env={**environment, "OMP_NUM_THREADS": THREADS},
+            pass_fds=[theirs.fileno()],
+        )
+        theirs.close()
+        _warm[interpreter] = ours, process
+    return _warm[interpreter][0]
+
+
+def end_warm_pythons() -> None:
+    while _warm:
+        ours, process = _warm.popitem()[1]
         ours.close()
         process.wait()
 

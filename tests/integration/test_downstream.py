@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from running import Program
 
 import memcomp_lightning
 
@@ -31,13 +32,24 @@ FAST = [
 ]
 
 
+def environment() -> dict[str, str]:
+    others = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST_"))}
+    return {**others, "OMP_NUM_THREADS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
+
+
 def run(*command: str | Path, folder: Path, status: int = 0) -> str:
     """Output of a command that ends with ``status``; the checkout is not on its path."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST_"))}
-    environment |= {"OMP_NUM_THREADS": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-    done = subprocess.run([*map(str, command)], cwd=folder, env=environment, capture_output=True, text=True)
+    done = subprocess.run([*map(str, command)], cwd=folder, env=environment(), capture_output=True, text=True)
     assert done.returncode == status, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout + done.stderr
+
+
+def run_warm(python: Path, *arguments: str | Path, folder: Path) -> str:
+    """Output of ``python ARGUMENTS``; torch, Lightning and our wheel are imported already."""
+    program = Program([*map(str, arguments)], folder, environment(), str(python))
+    out, err = program.communicate()
+    assert program.returncode == 0, out[-3000:] + err[-3000:]
+    return out + err
 
 
 @pytest.fixture(scope="session")
@@ -112,13 +124,13 @@ def python_with_plugins(
 
 def test_it_is_the_wheel_with_hydra_1_4(python: Path, tmp_path: Path) -> None:
     code = "import hydra, memcomp_lightning as m; print(hydra.__version__, m.__version__, m.__file__)"
-    version, own, file = run(python, "-c", code, folder=tmp_path).split()
+    version, own, file = run_warm(python, "-c", code, folder=tmp_path).split()
     assert (version, own) == (HYDRA, memcomp_lightning.__version__)
     assert Path(file).is_relative_to(python.parents[1])
 
 
 def test_its_module_trains_with_our_callbacks(python: Path, tmp_path: Path) -> None:
-    out = run(python.parent / "sparse-digits", "max_epochs=3", "hydra.run.dir=run", folder=tmp_path)
+    out = run_warm(python, python.parent / "sparse-digits", "max_epochs=3", "hydra.run.dir=run", folder=tmp_path)
     assert "RandomScan: sparsity 0." in out
     header = (tmp_path / "run/csv/version_0/metrics.csv").read_text().splitlines()[0].split(",")
     for name in ("reconstruction_error", "free_energy_gap", "energy_model", "negative_phase/bits_changed"):
@@ -127,22 +139,23 @@ def test_its_module_trains_with_our_callbacks(python: Path, tmp_path: Path) -> N
 
 def test_its_multirun_takes_its_sampler_and_ours(python: Path, tmp_path: Path) -> None:
     sweep = ["-m", "sampler=random_scan,cd", "max_epochs=1"]
-    out = run(python.parent / "sparse-digits", *sweep, folder=tmp_path)
+    out = run_warm(python, python.parent / "sparse-digits", *sweep, folder=tmp_path)
     assert re.findall(r"^(\w+): sparsity", out, flags=re.MULTILINE) == ["RandomScan", "CD"]
 
 
 def test_its_sampler_pretrains_our_dbn(python: Path, tmp_path: Path) -> None:
     train = [python.parent / "memcomp-train", "hydra.searchpath=[pkg://sparse_digits.conf]", "sampler=random_scan"]
-    run(*train, *FAST, "hydra.run.dir=run", folder=tmp_path)
+    out = run_warm(python, *train, *FAST, "hydra.run.dir=run", folder=tmp_path)
+    assert "test accuracy" in out
     assert len(json.loads((tmp_path / "run/result.json").read_text())["stages"]["pretrain"]["energy_gap"]) == 2
 
 
 def test_its_own_tests_pass(python: Path, project: Path) -> None:
-    assert "4 passed" in run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", folder=project)
+    assert "4 passed" in run_warm(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", folder=project)
 
 
 def test_help_of_our_command(python: Path, tmp_path: Path) -> None:
-    out = run(python.parent / "memcomp-train", "--help", folder=tmp_path)
+    out = run_warm(python, python.parent / "memcomp-train", "--help", folder=tmp_path)
     assert "sampler: annealer, cd, dmm_qubo" in out
     assert "hparams: pretraining" in out
 
@@ -179,7 +192,7 @@ for arguments in sys.argv[1:]:
 
 
 def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_path: Path) -> None:
-    messages = run(python, "-c", EACH_IN_TURN, *WITHOUT_EXTRAS, folder=tmp_path).splitlines()
+    messages = run_warm(python, "-c", EACH_IN_TURN, *WITHOUT_EXTRAS, folder=tmp_path).splitlines()
     for message, extra in zip(messages, WITHOUT_EXTRAS.values(), strict=True):
         assert message.startswith("memcomp-train: ")
         assert message.endswith(f"pip install 'memcomp-lightning[{extra}]'.")

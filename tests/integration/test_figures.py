@@ -396,12 +396,13 @@ def test_processes_end_with_the_one_that_started_them(start_process: Callable[..
 
 
 def _training_children(parent: int) -> list[int]:
-    """Child processes that have used a few seconds of processor time."""
-    found = subprocess.run(
-        ["ps", "-ww", "-o", "pid=,cputimes=,args=", "--ppid", str(parent)], capture_output=True, text=True
-    )
-    rows = [line.split(maxsplit=2) for line in found.stdout.splitlines()]
-    return [int(pid) for pid, seconds, command in rows if "spawn_main" in command and int(seconds) >= 3]
+    """Processes below one that have none below them and have used a second or more of processor time."""
+    found = subprocess.run(["ps", "-A", "-o", "pid=,ppid=,cputimes="], capture_output=True, text=True)
+    rows = [tuple(map(int, line.split())) for line in found.stdout.splitlines()]
+    below, parents = {parent}, {ppid for _, ppid, _ in rows}
+    for _ in range(3):
+        below |= {pid for pid, ppid, _ in rows if ppid in below}
+    return [pid for pid, _, seconds in rows if pid in below - parents - {parent} and seconds >= 1]
 
 
 def _alive(pid: int) -> bool:

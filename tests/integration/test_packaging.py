@@ -81,18 +81,6 @@ def test_one_version_everywhere() -> None:
     assert (ROOT / "CHANGELOG.md").read_text().count("## [Unreleased]") == 1
 
 
-def test_command_line_from_the_wheel(installed: Path, tmp_path: Path) -> None:
-    out = run(
-        str(installed / "bin" / "memcomp-train"),
-        "sampler=cd",
-        "pretrain.iterations=1",
-        "finetune.iterations=1",
-        folder=tmp_path,
-        path=installed,
-    )
-    assert "test accuracy" in out
-
-
 @pytest.mark.parametrize("from_wheel", [True, False], ids=["wheel", "editable"])
 def test_another_project_composes_our_groups(installed: Path, tmp_path: Path, from_wheel: bool) -> None:
     (tmp_path / "conf").mkdir()
