@@ -76,6 +76,8 @@ def in_words(error: BaseException) -> str:
     compared, _, kinds = str(error).partition(" not supported between instances of ")
     if isinstance(error, TypeError) and compared and "'str'" in kinds:
         return "text is given where a number is expected."
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename} cannot be read or written ({error.strerror})."
     if not isinstance(error, ModuleNotFoundError) or error.name is None or "pip install" in str(error):
         return str(error)
     module, _, leaf = error.name.rpartition(".")

@@ -53,18 +53,22 @@ def _parts(value: Any, name: str) -> list[tuple[DictConfig, str]]:
     return []
 
 
-@cache
 def _hints(target: object) -> dict[str, Any]:
     """The annotated arguments of a target; none of what is not ours to judge, or is not there."""
     if not isinstance(target, str) or not target.startswith(_CHECKED):
         return {}
     try:
-        module, _, name = target.rpartition(".")
-        made = getattr(import_module(module), name)
-        makers = (made.__init__, made.__new__) if inspect.isclass(made) else (made,)
-        hints = next(filter(None, map(typing.get_type_hints, makers)), {})
+        return _annotations(target)
     except Exception:  # the constructor's own failure has a better message
         return {}
+
+
+@cache
+def _annotations(target: str) -> dict[str, Any]:
+    module, _, name = target.rpartition(".")
+    made = getattr(import_module(module), name)
+    makers = (made.__init__, made.__new__) if inspect.isclass(made) else (made,)
+    hints = next(filter(None, map(typing.get_type_hints, makers)), {})
     hints.pop("return", None)
     return hints
 

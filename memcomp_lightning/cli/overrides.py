@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import math
+import os
 import re
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -298,7 +299,8 @@ def _with_search_path(overrides: Sequence[str], folder: Path) -> list[str]:
 def _check_writable(folder: Path, key: str) -> None:
     """Raise unless a file can be made where the run folder will be."""
     folder = folder.absolute()
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    # Path.exists raises where a folder on the way may not be entered.
+    existing = next(path for path in (folder, *folder.parents) if os.path.exists(path))  # noqa: PTH110
     try:
         with tempfile.TemporaryFile(dir=existing):
             pass

@@ -1,6 +1,6 @@
 """What a new user meets first: other installations, other systems, other habits."""
 
-import ctypes
+import json
 import os
 import subprocess
 import sys
@@ -8,74 +8,75 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from running import FAST, LOGGED, THREADS, Outcome
+from running import FAST, LOGGED, THREADS, Outcome, python
 
 Run = Callable[..., Outcome]
 
-WITHOUT = """
-import importlib.util
-import sys
+EACH_IN_TURN_WITHOUT_TENSORBOARD = """
+import contextlib, importlib.util, json, sys
+
+NAMES = ("tensorboard", "tensorboardX")
 
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {names!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+        if name.partition(".")[0] in NAMES:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Absent())
 known = importlib.util.find_spec
-importlib.util.find_spec = lambda name, package=None: None if name in {names!r} else known(name, package)
+importlib.util.find_spec = lambda name, package=None: None if name in NAMES else known(name, package)
+
+from hydra.core.global_hydra import GlobalHydra
+from memcomp_lightning.cli import train
+
+for name, arguments in json.loads(sys.argv[1]).items():
+    sys.argv[1:], status = arguments, 0
+    GlobalHydra.instance().clear()
+    with open(f"{name}.txt", "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        try:
+            train.main()
+        except SystemExit as stop:
+            status = stop.code
+        file.flush()
+    print(name, status)
 """
 
 
-def train(
-    folder: Path,
-    *arguments: str,
-    without: tuple[str, ...] = (),
-    before: Callable[[], None] | None = None,
-    **environment: str,
-) -> Outcome:
-    """Run ``memcomp-train`` as a process in which some packages are not installed."""
-    place = folder / "without"
-    place.mkdir(exist_ok=True)
-    (place / "sitecustomize.py").write_text(WITHOUT.format(names=without))
-    done = subprocess.run(
-        [sys.executable, "-m", "memcomp_lightning.cli.train", *arguments],
-        cwd=folder,
-        env={**os.environ, "OMP_NUM_THREADS": THREADS, "PYTHONPATH": str(place), **environment},
-        preexec_fn=before,
+def train(folder: Path, *arguments: str, before: str = "", **environment: str) -> Outcome:
+    """Run ``memcomp-train`` as a process that starts with some code."""
+    start = f"{before}\nfrom memcomp_lightning.cli import train\ntrain.main()"
+    process = python("-c", start, *arguments, folder=folder, **environment)
+    out, err = process.communicate()
+    assert process.returncode is not None
+    return Outcome(process.returncode, out, err)
+
+
+def test_without_tensorboard(tmp_path: Path) -> None:
+    """What to install or to choose; another logger, and figures with their pictures."""
+    small = ["data=digits", "data.partitions=2", "figure.passes=[1]", "figure.iterations=[1]", "figure.workers=1"]
+    commands = {
+        "refused": ["sampler=cd", *LOGGED],
+        "trained": ["sampler=cd", *LOGGED, "logger=csv", "hydra.run.dir=trained"],
+        "figure": [
+            *("experiment=figure4", "figure/curves=none", *small, "solver.max_steps=20", "hydra.run.dir=figure")
+        ],
+    }
+    done = subprocess.run(  # one that has imported nothing: whether TensorBoard is there is asked on import
+        [sys.executable, "-c", EACH_IN_TURN_WITHOUT_TENSORBOARD, json.dumps(commands)],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": THREADS},
         capture_output=True,
         text=True,
         check=False,
     )
-    return Outcome(done.returncode, done.stdout, done.stderr)
-
-
-def test_without_tensorboard_the_error_says_what_to_install_or_choose(tmp_path: Path) -> None:
-    absent = ("tensorboard", "tensorboardX")
-    refused = train(tmp_path, "sampler=cd", *LOGGED, without=absent)
-    assert refused.status == 2
-    assert "TensorBoard is not installed: pip install tensorboard, or logger=csv" in refused.err
-    assert "Traceback" not in refused.err
-    trained = train(tmp_path, "sampler=cd", *LOGGED, "logger=csv", "hydra.run.dir=run", without=absent)
-    assert trained.status == 0, trained.err
-    assert "Run folder:   run" in trained.out
-    assert "TensorBoard:" not in trained.out
-
-
-def test_without_tensorboard_figures_have_their_pictures(tmp_path: Path) -> None:
-    small = ["data=digits", "figure.passes=[1]", "figure.iterations=[1]", "figure/curves=none", "figure.workers=1"]
-    outcome = train(
-        tmp_path,
-        "experiment=figure4",
-        *small,
-        "data.partitions=2",
-        "solver.max_steps=20",
-        "hydra.run.dir=run",
-        without=("tensorboard", "tensorboardX"),
-    )
-    assert outcome.status == 0, outcome.err
-    assert "run gets no event file. pip install tensorboard" in outcome.out + outcome.err
-    assert (tmp_path / "run/report.html").stat().st_size > 0
+    said = {name: (tmp_path / f"{name}.txt").read_text() for name in commands}
+    assert done.stdout == "refused 2\ntrained 0\nfigure 0\n", (done.stderr, said)
+    assert "TensorBoard is not installed: pip install tensorboard, or logger=csv" in said["refused"]
+    assert "Traceback" not in said["refused"]
+    assert "Run folder:   trained" in said["trained"]
+    assert "TensorBoard:" not in said["trained"]
+    assert "figure gets no event file. pip install tensorboard" in said["figure"]
+    assert (tmp_path / "figure/report.html").stat().st_size > 0
 
 
 @pytest.mark.parametrize(
@@ -101,21 +102,29 @@ def test_a_terminal_without_colours_gets_none(tmp_path: Path) -> None:
     assert "\x1b" not in outcome.out + outcome.err
 
 
-def bound_by_permissions() -> None:
-    """Root of Linux gives up writing where permissions say no (prctl PR_CAPBSET_DROP, CAP_DAC_OVERRIDE)."""
-    if sys.platform == "linux" and os.geteuid() == 0:
-        ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)
+BOUND_BY_PERMISSIONS = """
+import ctypes, os, sys
+if sys.platform == "linux" and os.geteuid() == 0:  # root gives up all that it may do more than others
+    ctypes.CDLL(None).capset((ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)())
+"""
 
 
-def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
-    (tmp_path / "closed").mkdir(mode=0o500)
-    probe = subprocess.run(["touch", "closed/probe"], cwd=tmp_path, preexec_fn=bound_by_permissions, check=False)
+@pytest.mark.parametrize("mode", [0o500, 0o600], ids=["not to be written", "not to be entered"])
+def test_a_folder_without_permission_is_named(tmp_path: Path, mode: int) -> None:
+    (tmp_path / "closed").mkdir(mode=mode)
+    probe = python("-c", f"{BOUND_BY_PERMISSIONS}\nopen('closed/probe', 'w')", folder=tmp_path)
+    probe.communicate()
     if probe.returncode == 0:
         pytest.skip("permissions do not bind this user")
-    outcome = train(tmp_path, "sampler=cd", *FAST, "hydra.run.dir=closed/run", before=bound_by_permissions)
+    outcome = train(tmp_path, "sampler=cd", *FAST, "hydra.run.dir=closed/run", before=BOUND_BY_PERMISSIONS)
     assert outcome.status == 2
     assert outcome.err.startswith(f"memcomp-train: hydra.run.dir = {tmp_path}/closed/run is not allowed: ")
     assert outcome.err.endswith("(Permission denied). Choose another folder with hydra.run.dir=PATH.\n")
+    assert "Traceback" not in outcome.err
+    outcome = train(tmp_path, "resume=closed/run", before=BOUND_BY_PERMISSIONS)
+    assert outcome.status == 2
+    assert outcome.err.startswith("memcomp-train: ")
+    assert "closed/run" in outcome.err
     assert "Traceback" not in outcome.err
 
 

@@ -1,3 +1,4 @@
+import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,6 +7,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig, OmegaConf
 
+from memcomp_lightning.cli import kinds
 from memcomp_lightning.cli.hydra_versions import INITIALIZE
 from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.overrides import CONFIG_MODULE
@@ -38,13 +40,14 @@ def numbers(settings: DictConfig, name: str = "") -> Iterator[str]:
             yield full_name
 
 
-@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("option", ["", *OPTIONS])
 def test_words_and_lists_in_place_of_every_number(option: str) -> None:
-    config = composed(option)
+    """Of an option, those that it brings; of none, all that there are."""
+    config = composed(*filter(None, [option]))
     check_kinds(config)
     found = set(numbers(config)) - NUMBER_OR_WORD
     assert found
-    for name in found:
+    for name in (name for name in found if name.startswith(option.partition("=")[0])):
         number = OmegaConf.select(config, name)
         for wrong, shown in (("oops", "'oops'"), ([1], "[1]"), (True, "True")):
             OmegaConf.update(config, name, wrong)
@@ -52,6 +55,17 @@ def test_words_and_lists_in_place_of_every_number(option: str) -> None:
                 check_kinds(config)
         OmegaConf.update(config, name, number)
     check_kinds(config)
+
+
+def test_a_package_that_was_missing_once_is_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = composed("sampler=annealer")
+    config.sampler.rate = "oops"
+    kinds._annotations.cache_clear()
+    with monkeypatch.context() as absent:
+        absent.setattr(kinds, "import_module", lambda name: importlib.import_module("not_installed"))
+        check_kinds(config)
+    with pytest.raises(SettingError):
+        check_kinds(config)
 
 
 @pytest.mark.parametrize(

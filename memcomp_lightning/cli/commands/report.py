@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from memcomp_lightning.cli.arguments import as_typed
-from memcomp_lightning.cli.errors import UserError, refuse
+from memcomp_lightning.cli.errors import UserError, in_words, refuse
 from memcomp_lightning.cli.event_files import event_file
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.table import aligned, short_path
@@ -113,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (UserError, SettingError) as error:
         refuse(COMMAND, error)
     except OSError as error:
-        refuse(COMMAND, UserError(f"{error.filename} cannot be read or written ({error.strerror})."))
+        refuse(COMMAND, UserError(in_words(error)))
     for section in sections:
         if section.verdicts:
             say(f"\n{section.title}\n{verdict_table(section.verdicts)}")

@@ -20,7 +20,7 @@ from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, fro
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.commands import report
-from memcomp_lightning.cli.errors import UserError, explain, refuse
+from memcomp_lightning.cli.errors import UserError, explain, in_words, refuse
 from memcomp_lightning.cli.hydra_versions import MAIN
 from memcomp_lightning.cli.output import make_tolerant, say
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, search_path
@@ -177,13 +177,16 @@ def main() -> None:
     _silence_lightning()
     try:
         if "LOCAL_RANK" not in os.environ:
-            line = check_command_line(
-                _read(sys.argv[1:]),
-                config_name="config",
-                check=_check,
-                folders=("runs", "multirun"),
-                check_searchable=check_searchable,
-            )
+            try:
+                line = check_command_line(
+                    _read(sys.argv[1:]),
+                    config_name="config",
+                    check=_check,
+                    folders=("runs", "multirun"),
+                    check_searchable=check_searchable,
+                )
+            except OSError as error:
+                raise UserError(in_words(error)) from error
             sys.argv[1:] = line.arguments
             with answering(line):
                 train()
