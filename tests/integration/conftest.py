@@ -1,14 +1,19 @@
 """Ways to run the command line: in this process where that is enough, as a real process where it is not."""
 
+import copy
+import functools
 import logging
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import jaxtyping
+import lightning.fabric.utilities.registry as lightning_registry
+import omegaconf.base
 import pytest
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
@@ -59,7 +64,16 @@ def _composed_once() -> Iterator[None]:
         """Of the command line: composed again only where it may be set."""
         return get_mode(hydra, config_name, overrides) if any("hydra.mode" in o for o in overrides) else None
 
+    def copied(repository: ConfigRepository, memo: dict[int, Any]) -> ConfigRepository:
+        """Sources do not change; which of them are looked in may."""
+        other = copy.copy(repository)
+        other.sources = list(repository.sources)
+        return other
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConfigRepository, "__deepcopy__", copied, raising=False)
+        patch.setattr(omegaconf.base, "parse", functools.cache(omegaconf.base.parse))
+        patch.setattr(lightning_registry, "entry_points", functools.cache(entry_points))
         patch.setattr(ConfigLoaderImpl, "_load_configuration_impl", composed)
         patch.setattr(ConfigRepository, "load_config", load_config)
         patch.setattr(Hydra, "get_mode", mode)
