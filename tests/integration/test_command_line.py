@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from running import FAST, LOGGED, MOCK_QPU, Outcome
+from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.cli.build import build
@@ -25,7 +25,8 @@ def options(group: str) -> list[str]:
 @pytest.mark.parametrize("sampler", [name for name in options("sampler") if name != "exact"])
 def test_every_sampler_trains(memcomp_train: Run, sampler: str) -> None:
     qpu = [MOCK_QPU] if sampler == "dwave_qpu" else []
-    outcome = memcomp_train(f"sampler={sampler}", *qpu, *LOGGED, "solver.n_restarts=3", "hydra.run.dir=run")
+    settings = [*FAST, "logger=tensorboard", "solver.n_restarts=3", "hydra.run.dir=run"]
+    outcome = memcomp_train(f"sampler={sampler}", *qpu, *settings)
     assert outcome.status == 0, outcome.err
     assert "pretrain layer 2" in outcome.out
     assert "tensorboard --logdir run" in outcome.out

@@ -211,7 +211,7 @@ for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
     except ModuleNotFoundError as error:
         print(name, error)
 """
-    out = run(python, "-c", code, folder=tmp_path)
+    out = run_warm(python, "-c", code, folder=tmp_path)
     extras = re.findall(r"^(\w+) .*pip install 'memcomp-lightning\[(\w+)\]'\.$", out, flags=re.MULTILINE)
     assert extras == [("DimodSolver", "dimod"), ("DmmDimodSampler", "dimod"), ("QpuSampler", "dwave")]
 

@@ -64,7 +64,7 @@ def test_exact_phases_learn_the_data(kind: str, centring: Centring | None) -> No
         model,
         Exact(),
         positive=ExactPosterior(),
-        iterations=400,
+        iterations={"DBM": 400, "full": 150}[kind],
         optimizer=partial(torch.optim.SGD, lr=1.0, momentum=0.5),
         centring=centring,
     )

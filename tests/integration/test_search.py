@@ -87,8 +87,8 @@ def test_a_storage_that_optuna_cannot_use_is_refused(memcomp_train: Run) -> None
 def test_local_submitit_launcher(start_process: Callable[..., Program], tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     own = ["hydra/launcher=submitit_local", "hydra.sweep.dir=sweep"]
-    out, errors = start_process("-m", "sampler=cd", "seed=0,1", "callbacks=minimal", *FAST, *own).communicate()
-    assert "2 x 1" in out, errors
+    out, errors = start_process("-m", "sampler=cd", "seed=1", "callbacks=minimal", *FAST, *own).communicate()
+    assert "1 x 1" in out, errors
     assert "failed" not in out
     assert (tmp_path / "sweep/.submitit").exists()
 
