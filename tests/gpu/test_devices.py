@@ -55,7 +55,7 @@ def test_samplers_draw_the_same_on_both_devices(sampler, device: str) -> None:
     "solver",
     [
         AlternatingDescent(),
-        DmmSolver(n_restarts=8, patience=7, max_steps=41, record=Recording()),
+        DmmSolver(n_restarts=8, patience=7, max_steps=31, record=Recording()),
         DmmSolver(patience=7, max_steps=101, quench_every=0, warm=WarmRestart()),
         DmmSolver(field=BondField(), max_steps=101),
     ],

@@ -98,7 +98,7 @@ def _warm_python(interpreter: str) -> socket.socket:
     if interpreter not in _warm:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         script = Path(__file__).with_name("warm.py")
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         process = subprocess.Popen(
             [interpreter, script, str(theirs.fileno()), *WARM],
             env={**environment, "OMP_NUM_THREADS": THREADS},

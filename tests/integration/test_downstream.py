@@ -44,9 +44,9 @@ def run(*command: str | Path, folder: Path, status: int = 0) -> str:
     return done.stdout + done.stderr
 
 
-def run_warm(python: Path, *arguments: str | Path, folder: Path) -> str:
+def run_warm(python: Path, *arguments: str | Path, folder: Path, **also: str) -> str:
     """Output of ``python ARGUMENTS``; torch, Lightning and our wheel are imported already."""
-    program = Program([*map(str, arguments)], folder, environment(), str(python))
+    program = Program([*map(str, arguments)], folder, {**environment(), **also}, str(python))
     out, err = program.communicate()
     assert program.returncode == 0, out[-3000:] + err[-3000:]
     return out + err
@@ -111,15 +111,14 @@ def python(
 
 
 @pytest.fixture(scope="session")
-def python_with_plugins(
-    python: Path, requirements: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """A second environment on top of it, with the extra for sweeps."""
+def plugins(python: Path, requirements: Path, constraints: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Packages of a second environment on top of it, with the extra for sweeps."""
     site_packages = python.parents[1] / "lib/python{}.{}/site-packages".format(*sys.version_info)
-    plugins = [f"hydra-{name}=={HYDRA}" for name in ("joblib-launcher", "optuna-sweeper", "submitit-launcher")]
-    packages = ["memcomp-lightning[sweep]", *plugins]
+    own = [f"hydra-{name}=={HYDRA}" for name in ("joblib-launcher", "optuna-sweeper", "submitit-launcher")]
     folder = tmp_path_factory.mktemp("plugins") / "venv"
-    return new_environment(folder, *packages, below=[site_packages, requirements], constraints=constraints)
+    below = [site_packages, requirements]
+    new_environment(folder, "memcomp-lightning[sweep]", *own, below=below, constraints=constraints)
+    return folder / site_packages.relative_to(python.parents[1])
 
 
 def test_it_is_the_wheel_with_hydra_1_4(python: Path, tmp_path: Path) -> None:
@@ -216,9 +215,10 @@ for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
     assert extras == [("DimodSolver", "dimod"), ("DmmDimodSampler", "dimod"), ("QpuSampler", "dwave")]
 
 
-def test_parallel_search_with_hydra_1_4(python_with_plugins: Path, tmp_path: Path) -> None:
-    train = [python_with_plugins, "-m", "memcomp_lightning.cli.train", "-m", "callbacks=minimal", *FAST]
+def test_parallel_search_with_hydra_1_4(python: Path, plugins: Path, tmp_path: Path) -> None:
+    train = ["-m", "memcomp_lightning.cli.train", "-m", "callbacks=minimal", *FAST]
     search = ["hparams=pretraining", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra/launcher=joblib"]
     storage = ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=trials"]
-    run(*train, "sampler=cd", *search, *storage, "hydra.sweep.dir=search", folder=tmp_path)
+    own = {"folder": tmp_path, "PYTHONPATH": str(plugins)}
+    run_warm(python, *train, "sampler=cd", *search, *storage, "hydra.sweep.dir=search", **own)
     assert "best_value" in (tmp_path / "search/optimization_results.yaml").read_text()

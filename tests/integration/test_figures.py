@@ -152,29 +152,46 @@ def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run) -> None
         assert float(row["test_accuracy_error"]) == pytest.approx(float(point["standard_error"]), abs=1e-9)
 
 
-@pytest.mark.usefixtures("no_pages")
-@pytest.mark.parametrize("control", [name for name in options("control") if name != "exact"])
-def test_every_control_in_a_figure_is_the_control_of_a_single_run(memcomp_train: Run, control: str) -> None:
-    untrained = ("no_pretraining", "gaussian", "xavier_1", "xavier_4", "bn_relu", "bn_relu_regularised")
-    iterations = 0 if control in untrained else 2
-    curve = f"+figure.curves.x={{label: x, overrides: ['control={control}'], iterations: [{iterations}]}}"
-    drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", "figure.claims=[{better:x,than:x}]"]
-    quick = ["solver.n_restarts=3"] + ([] if control in ("descent", "annealing") else ["solver.max_steps=20"])
-    small = [o for o in SMALL if not o.startswith("solver")] + quick
-    outcome = memcomp_train("experiment=figure4", *small, NO_CONTROLS, curve, *drop, "hydra.run.dir=run")
-    assert outcome.status == 0, outcome.err
+UNTRAINED = ("no_pretraining", "gaussian", "xavier_1", "xavier_4", "bn_relu", "bn_relu_regularised")
+CONTROLS = {name: 0 if name in UNTRAINED else 2 for name in options("control") if name != "exact"}
+"""With the iterations of pretraining."""
+
+
+@pytest.fixture
+def controls(memcomp_train: Run, no_pages: None, tmp_path_factory: pytest.TempPathFactory) -> Records:
+    """Of a figure that has them all; trained once a worker."""
+    folder = tmp_path_factory.getbasetemp() / "controls"
+    if not folder.exists():
+        curve = "+figure.curves.{0}={{label: {0}, overrides: ['control={0}'], iterations: [{1}]}}"
+        curves = [curve.format(*control) for control in CONTROLS.items()]
+        claims = "figure.claims=[{better:none,than:none}]"
+        drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", claims]
+        outcome = memcomp_train(
+            "experiment=figure4", *SMALL, NO_CONTROLS, *curves, *drop, f"hydra.run.dir={folder}"
+        )
+        assert outcome.status == 0, outcome.err
+    return Records(folder)
+
+
+def applies(setting: str, control: str) -> bool:
+    return not setting.startswith("solver.max_steps") or control not in ("descent", "annealing")
+
+
+@pytest.mark.xdist_group("controls")
+@pytest.mark.parametrize("control", CONTROLS)
+def test_every_control_in_a_figure_is_the_control_of_a_single_run(
+    memcomp_train: Run, controls: Records, control: str
+) -> None:
     single = memcomp_train(
-        "preset=paper",
-        *QUIET,
-        *[o for o in small if not o.startswith("figure")],
+        *[setting for setting in SINGLE if applies(setting, control)],
         f"control={control}",
-        f"pretrain.iterations={iterations}",
+        f"pretrain.iterations={CONTROLS[control]}",
         "finetune.iterations=2",
         "hydra.run.dir=single",
     )
     assert single.status == 0, single.err
     result = json.loads(Path("single/result.json").read_text())
-    record = only(records(), "x", iterations)
+    record = only(controls, control, CONTROLS[control])
     if control == "bn_relu_regularised":  # the single run keeps the pass that was best on held-out images
         assert record.at_best_validation()[1] == pytest.approx(result["test_accuracy"], abs=1e-9)
     else:
