@@ -24,10 +24,11 @@ import matplotlib.pyplot as plt
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import ClauseField, DmmSolver, Recording
 from memcomp_lightning.models import RBM, Gaussian
 from memcomp_lightning.plotting import plot_trajectory
-from memcomp_lightning.qubo import AlternatingDescent, BranchAndBound, Status, from_model, from_qubo
+from memcomp_lightning.problems import from_model, from_qubo
+from memcomp_lightning.solvers import AlternatingDescent, BranchAndBound, Status
+from memcomp_lightning.solvers.dmm import ClauseField, DmmSolver, Recording
 
 rbm = RBM(32, 32, weight_init=Gaussian(std=0.5), generator=rng.stream(0, "weights"))
 with torch.no_grad():

@@ -28,12 +28,12 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import BarsAndStripes, ImageDataModule
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.likelihood import kl_divergence
 from memcomp_lightning.models import DBN
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.replicas import Rates, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 N_SEEDS, N_UPDATES = 10, 2000
 images = BarsAndStripes(side=3).load()

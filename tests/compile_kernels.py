@@ -8,9 +8,10 @@ import sys
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.likelihood import log_partition_function
-from memcomp_lightning.qubo import BranchAndBound, Qubo, from_model
+from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.solvers import BranchAndBound
+from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.testing import small_rbm
 
 

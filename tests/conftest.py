@@ -65,7 +65,8 @@ def jaxtyped_where_there_are_shapes(*, typechecker):
 
 jaxtyped, jaxtyping.jaxtyped = jaxtyping.jaxtyped, jaxtyped_where_there_are_shapes
 
-HOOKED = [f"memcomp_lightning.{name}" for name in ("models", "objective", "qubo", "dmm", "samplers", "likelihood")]
+LAYERS = ("models", "objective", "problems", "solvers", "samplers", "likelihood")
+HOOKED = [f"memcomp_lightning.{name}" for name in LAYERS]
 
 # pytest forgets a module called conftest; the hook looks its checker up by name, at each failure.
 sys.modules["memcomp_lightning_tests"] = sys.modules[__name__]

@@ -19,7 +19,9 @@ import matplotlib
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import (
+from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
@@ -30,8 +32,6 @@ from memcomp_lightning.dmm import (
     Strang,
     WarmRestart,
 )
-from memcomp_lightning.models import RBM, Gaussian
-from memcomp_lightning.qubo import Qubo, from_model
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

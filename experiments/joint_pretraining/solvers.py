@@ -13,11 +13,11 @@ from dimod import BinaryQuadraticModel
 from dwave.samplers import SimulatedAnnealingSampler
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.models import DBM, BoltzmannMachine, Gaussian
-from memcomp_lightning.qubo import Qubo
+from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers.ground_state import problem_of
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 STD = 0.3
 """Of couplings and biases: about where trained machines are."""

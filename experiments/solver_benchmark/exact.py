@@ -9,8 +9,8 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.qubo import Bipartite, Qubo
-from memcomp_lightning.qubo.search import search
+from memcomp_lightning.problems import Bipartite, Qubo
+from memcomp_lightning.solvers.kernels.branch_and_bound import search
 
 
 class Proof(NamedTuple):

@@ -12,7 +12,7 @@ from planted import frustrated_loops
 from trained import Training
 
 from memcomp_lightning import rng
-from memcomp_lightning.qubo import Qubo, WeightedMaxSat, from_model
+from memcomp_lightning.problems import Qubo, WeightedMaxSat, from_model
 
 SEED = 2020
 Purpose = Literal["tuning", "report"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning.qubo import Bipartite, Qubo, WeightedMaxSat, read_problem
+from memcomp_lightning.problems import Bipartite, Qubo, WeightedMaxSat, read_problem
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from dwave.samplers import SimulatedAnnealingSampler, TabuSampler
 from quadratise import quadratise
 from torch import Tensor
 
-from memcomp_lightning.qubo import Qubo, WeightedMaxSat
+from memcomp_lightning.problems import Qubo, WeightedMaxSat
 
 Problem = Qubo | WeightedMaxSat
 

@@ -10,7 +10,7 @@ At a density of .75 loops a spin simulated annealing fails most often (looked at
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning.qubo import Bipartite, Qubo
+from memcomp_lightning.problems import Bipartite, Qubo
 
 
 def frustrated_loops(

@@ -6,7 +6,7 @@ import functools
 import torch
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.qubo import Qubo, WeightedMaxSat, to_qubo
+from memcomp_lightning.problems import Qubo, WeightedMaxSat, to_qubo
 
 
 @functools.lru_cache(maxsize=2)

@@ -16,8 +16,9 @@ from simulated_bifurcation.core import Ising
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import BondField, ClauseField, DmmSolver, VectorField
-from memcomp_lightning.qubo import AlternatingDescent, Bipartite, Qubo
+from memcomp_lightning.problems import Bipartite, Qubo
+from memcomp_lightning.solvers import AlternatingDescent
+from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, VectorField
 
 
 def in_parts(problem: Problem, part: Callable[[int], tuple[Tensor, float]], n_reads: int, size: int) -> Reads:

@@ -20,7 +20,7 @@ from side_by_side import SOLVERS
 
 import memcomp_lightning
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.qubo import Bipartite, Qubo, WeightedMaxSat, to_qubo
+from memcomp_lightning.problems import Bipartite, Qubo, WeightedMaxSat, to_qubo
 
 Row = dict[str, Any]
 N_FINALISTS = 4

@@ -15,8 +15,8 @@ from opponents import SimulatedAnnealing, Tabu, energies
 from sweep import Row, Store, version
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import DmmSolver
-from memcomp_lightning.qubo import Qubo
+from memcomp_lightning.problems import Qubo
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 N_CALLS = 10
 QUICK = DmmSolver(n_restarts=8, max_steps=200, stall=None)

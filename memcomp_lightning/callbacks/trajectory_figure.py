@@ -8,10 +8,11 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, rbm_of, tensorboards, write_figure
-from memcomp_lightning.dmm import DmmSolver, Recording
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.plotting.trajectory import plot_trajectory
-from memcomp_lightning.qubo import Qubo, QuboSolver, from_model
+from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.solvers import QuboSolver
+from memcomp_lightning.solvers.dmm import DmmSolver, Recording
 
 
 class TrajectoryFigure(EveryIterations):

@@ -14,12 +14,13 @@ from memcomp_lightning.cli.commands.report import save
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.units import pretrained
-from memcomp_lightning.dmm import DmmSolver, Recording
 from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.files import write_text
 from memcomp_lightning.models import DBN
 from memcomp_lightning.plotting import plot_trajectory
-from memcomp_lightning.qubo import Trajectory, from_model
+from memcomp_lightning.problems import from_model
+from memcomp_lightning.solvers import Trajectory
+from memcomp_lightning.solvers.dmm import DmmSolver, Recording
 
 
 def prepare(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolver]:

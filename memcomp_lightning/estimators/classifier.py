@@ -24,7 +24,6 @@ from memcomp_lightning.defaults import (
     LEARNING_RATE,
     PASSES,
 )
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.estimators.base import (
     Drawn,
@@ -42,6 +41,7 @@ from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.replicas import Backpropagation, Rates, pretrain, pretrain_jointly, require_finite
 from memcomp_lightning.samplers import GroundState, MeanField
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 UNLABELLED = -1
 """Label of the samples that have none, where the other labels are numbers."""

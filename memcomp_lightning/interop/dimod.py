@@ -12,7 +12,8 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.models import RBM, BoltzmannMachine
-from memcomp_lightning.qubo import Qubo, QuboSolution, Status, from_model
+from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.solvers import QuboSolution, Status
 from memcomp_lightning.types import Configurations, NegativePhase
 
 try:

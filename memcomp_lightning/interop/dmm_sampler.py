@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.interop.dimod import from_bqm
-from memcomp_lightning.qubo import QuboSolver, Status
+from memcomp_lightning.solvers import QuboSolver, Status
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 
 class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]

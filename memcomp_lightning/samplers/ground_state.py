@@ -9,8 +9,9 @@ from torch import Generator, Tensor
 from memcomp_lightning.errors import require, require_choice, require_parts
 from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
 from memcomp_lightning.models.rbm import RBM
-from memcomp_lightning.qubo.from_model import from_model
-from memcomp_lightning.qubo.qubo import Qubo, QuboSolution, QuboSolver, Status
+from memcomp_lightning.problems.from_model import from_model
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 

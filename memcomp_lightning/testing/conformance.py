@@ -11,9 +11,10 @@ from memcomp_lightning import rng
 from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, Gaussian
 from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import BruteForce, Qubo, QuboSolver, from_model
+from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of
 from memcomp_lightning.samplers.base import require_sampler
+from memcomp_lightning.solvers import BruteForce, QuboSolver
 from memcomp_lightning.types import Configurations
 
 ModelT = TypeVar("ModelT", RBM, DBM, BoltzmannMachine)

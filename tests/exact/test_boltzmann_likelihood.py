@@ -19,8 +19,8 @@ from memcomp_lightning.models import DBM, BoltzmannMachine, folded
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import BruteForce
 from memcomp_lightning.samplers import CD, Exact, ExactPosterior, GroundState, MeanField
+from memcomp_lightning.solvers import BruteForce
 from memcomp_lightning.testing import small_dbm, small_machine
 from memcomp_lightning.testing.conformance import _with_biases
 

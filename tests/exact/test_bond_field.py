@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import BondField
-from memcomp_lightning.dmm.bond import BondMachine, BondState
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
+from memcomp_lightning.solvers.dmm import BondField
+from memcomp_lightning.solvers.dmm.bond import BondMachine, BondState
 
 SPARSE = EdgeList(n=7, pairs=torch.tensor([[0, 1], [0, 3], [1, 6], [2, 3], [2, 6], [3, 6], [4, 6]]))
 GRAPHS = {"bipartite 5 + 3": Bipartite(5, 3), "bipartite 3 + 5": Bipartite(3, 5), "edge list": SPARSE}

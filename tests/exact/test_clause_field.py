@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import AdaptiveEuler, ClauseField, Splitting
-from memcomp_lightning.dmm.clause import ClauseState
-from memcomp_lightning.dmm.scaling import DEGREE_EXPONENT, SIZE_EXPONENT
-from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo
-from memcomp_lightning.qubo.maxsat import Clauses
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo
+from memcomp_lightning.problems.maxsat import Clauses
+from memcomp_lightning.solvers.dmm import AdaptiveEuler, ClauseField, Splitting
+from memcomp_lightning.solvers.dmm.clause import ClauseState
+from memcomp_lightning.solvers.dmm.scaling import DEGREE_EXPONENT, SIZE_EXPONENT
 from memcomp_lightning.testing.conformance import small_rbm
 
 SPARSE = EdgeList(n=7, pairs=torch.tensor([[0, 1], [0, 3], [1, 6], [2, 3], [2, 6], [3, 6], [4, 6]]))

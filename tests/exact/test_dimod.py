@@ -14,7 +14,6 @@ pytest.importorskip("dwave.samplers")
 from dwave.samplers import SimulatedAnnealingSampler, TabuSampler  # noqa: E402
 
 from memcomp_lightning import rng  # noqa: E402
-from memcomp_lightning.dmm import DmmSolver  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
 from memcomp_lightning.interop import (  # noqa: E402
     AnnealerSamples,
@@ -26,9 +25,11 @@ from memcomp_lightning.interop import (  # noqa: E402
 )
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
 from memcomp_lightning.models.enumeration import binary_states  # noqa: E402
-from memcomp_lightning.qubo import BruteForce, Qubo, Status, from_model  # noqa: E402
+from memcomp_lightning.problems import Qubo, from_model  # noqa: E402
 from memcomp_lightning.samplers import positive_phase  # noqa: E402
 from memcomp_lightning.samplers.gibbs import chains_of  # noqa: E402
+from memcomp_lightning.solvers import BruteForce, Status  # noqa: E402
+from memcomp_lightning.solvers.dmm import DmmSolver  # noqa: E402
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
 
 SHORT = {"num_reads": 7, "num_sweeps": 50}

@@ -12,7 +12,14 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import (
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models import RBM
+from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.objective import contrast
+from memcomp_lightning.problems import Qubo, WeightedMaxSat, from_model, from_qubo
+from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
+from memcomp_lightning.solvers import BruteForce, Status
+from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
@@ -24,16 +31,8 @@ from memcomp_lightning.dmm import (
     Strang,
     WarmRestart,
 )
-from memcomp_lightning.dmm import (
-    solver as solver_module,
-)
-from memcomp_lightning.dmm.kernels import cpu, reference
-from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import BruteForce, Qubo, Status, WeightedMaxSat, from_model, from_qubo
-from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
+from memcomp_lightning.solvers.dmm import solver as solver_module
+from memcomp_lightning.solvers.dmm.kernels import cpu, reference
 from memcomp_lightning.testing.conformance import small_rbm
 
 

@@ -7,7 +7,10 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import (
+from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
+from memcomp_lightning.solvers import BruteForce, Status
+from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
@@ -19,10 +22,8 @@ from memcomp_lightning.dmm import (
     Strang,
     WarmRestart,
 )
-from memcomp_lightning.dmm.kernels import cpu, reference
-from memcomp_lightning.dmm.kernels.run import Start
-from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import Bipartite, BruteForce, EdgeList, Qubo, Status, WeightedMaxSat, from_qubo
+from memcomp_lightning.solvers.dmm.kernels import cpu, reference
+from memcomp_lightning.solvers.dmm.kernels.run import Start
 
 SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
 FIELDS = {

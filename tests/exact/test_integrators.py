@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import (
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.problems import Qubo
+from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
@@ -18,8 +20,6 @@ from memcomp_lightning.dmm import (
     Splitting,
     Strang,
 )
-from memcomp_lightning.errors import SettingError
-from memcomp_lightning.qubo import Qubo
 
 SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
 

@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
-from memcomp_lightning.dmm.kernels import cpu, lanes, reference
-from memcomp_lightning.dmm.kernels.run import Stall, Start
-from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, Status, WeightedMaxSat, from_qubo
-from memcomp_lightning.qubo.maxsat import Clauses
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
+from memcomp_lightning.problems.maxsat import Clauses
+from memcomp_lightning.solvers import Status
+from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
+from memcomp_lightning.solvers.dmm.kernels import cpu, lanes, reference
+from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
 
 # Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
 SLOW = Splitting(change=0.3, dt_min=0.01, dt_max=0.4, lag=0.2)

@@ -9,7 +9,6 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import BruteForce
 from memcomp_lightning.samplers import (
     PCD,
     GroundState,
@@ -20,6 +19,7 @@ from memcomp_lightning.samplers import (
     with_tensors,
 )
 from memcomp_lightning.samplers.mode_assisted import mode_scale
+from memcomp_lightning.solvers import BruteForce
 from memcomp_lightning.testing.conformance import small_rbm
 from memcomp_lightning.types import Configurations
 

@@ -9,17 +9,16 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.dmm import BondField, DmmSolver
-from memcomp_lightning.qubo import (
+from memcomp_lightning.problems import Qubo, read_problem, to_qubo
+from memcomp_lightning.solvers import (
     AlternatingDescent,
+    Answer,
     BruteForce,
     GibbsAnnealing,
-    Qubo,
     Status,
-    read_problem,
-    to_qubo,
     write_solution,
 )
+from memcomp_lightning.solvers.dmm import BondField, DmmSolver
 
 SOLVERS = {
     "brute force": BruteForce(),
@@ -62,7 +61,7 @@ def answer_of(name, problem, seed):
         given = to_qubo(given)
     if name == "brute force" and not problem.resolved and problem.integers is not None:
         given = problem.integers
-    return problem.answer(solver.minimise(given, generator=rng.stream(seed, "solver")))
+    return Answer.of(problem, solver.minimise(given, generator=rng.stream(seed, "solver")))
 
 
 def random_formula(seed):
@@ -178,7 +177,7 @@ def test_the_best_restart_is_feasible_whatever_its_cost(tmp_path):
     four = type(solution)(
         states.double(), torch.zeros(4), torch.full((4,), int(Status.STEP_BUDGET)), states[:, 0], 0.0
     )
-    answer = problem.answer(four)
+    answer = Answer.of(problem, four)
     assert answer.assignment.tolist() == [False, True]
     assert answer.score == (2**60, 0)
     assert (answer.n_run, answer.n_reached) == (4, 1)
@@ -202,9 +201,9 @@ def test_float_arithmetic_that_cannot_prove_says_so(tmp_path):
     )
     assert exact.status.tolist() == [Status.OPTIMAL]
     assert rounded.status.tolist() == [Status.ROUNDED]
-    assert problem.answer(exact).score.value == 2**53 + 2
+    assert Answer.of(problem, exact).score.value == 2**53 + 2
     claimed = type(rounded)(rounded.assignments, rounded.energies, exact.status, rounded.steps, 0.0)
-    assert problem.answer(claimed).status == [Status.ROUNDED], "float64 proves nothing here, whoever says so"
+    assert Answer.of(problem, claimed).status == [Status.ROUNDED], "float64 proves nothing here, whoever says so"
 
 
 def test_energies_a_rounding_apart_are_not_the_same(tmp_path):
@@ -214,7 +213,7 @@ def test_energies_a_rounding_apart_are_not_the_same(tmp_path):
     two = type(solution)(
         torch.tensor([[1.0, 1.0], [1.0, 0.0]]), solution.energies, solution.status, solution.steps, 0.0
     )
-    assert problem.answer(two).n_reached == 1
+    assert Answer.of(problem, two).n_reached == 1
 
 
 def test_numbers_in_json_are_whole(tmp_path):

@@ -11,8 +11,8 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo, to_qubo
-from memcomp_lightning.qubo.maxsat import Clauses
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model, from_qubo, to_qubo
+from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.testing.conformance import small_rbm
 
 SPARSE = EdgeList(n=7, pairs=torch.tensor([[0, 1], [0, 3], [1, 6], [2, 3], [2, 6], [3, 6], [4, 6]]))

@@ -8,16 +8,8 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import (
-    AlternatingDescent,
-    Bipartite,
-    BranchAndBound,
-    BruteForce,
-    GibbsAnnealing,
-    Qubo,
-    Status,
-    from_model,
-)
+from memcomp_lightning.problems import Bipartite, Qubo, from_model
+from memcomp_lightning.solvers import AlternatingDescent, BranchAndBound, BruteForce, GibbsAnnealing, Status
 from memcomp_lightning.testing.conformance import small_rbm
 
 

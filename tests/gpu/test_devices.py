@@ -11,7 +11,6 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import Digits, ImageDataModule
-from memcomp_lightning.dmm import BondField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.likelihood import (
     Ais,
     ReverseAis,
@@ -25,10 +24,12 @@ from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, EdgeList, Qubo, WeightedMaxSat, from_model
-from memcomp_lightning.qubo.maxsat import Clauses
+from memcomp_lightning.problems import EdgeList, Qubo, WeightedMaxSat, from_model
+from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.replicas import Rates, finetune, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, MeanField, Quench, positive_phase
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce
+from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.testing import small_dbm, small_machine, small_rbm
 
 

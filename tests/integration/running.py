@@ -98,10 +98,12 @@ def _warm_python(interpreter: str) -> socket.socket:
     if interpreter not in _warm:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         script = Path(__file__).with_name("warm.py")
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        environment = {**os.environ, "OMP_NUM_THREADS": THREADS}
+        if interpreter != sys.executable:  # what is installed there
+            environment.pop("PYTHONPATH", None)
         process = subprocess.Popen(
             [interpreter, script, str(theirs.fileno()), *WARM],
-            env={**environment, "OMP_NUM_THREADS": THREADS},
+            env=environment,
             pass_fds=[theirs.fileno()],
         )
         theirs.close()

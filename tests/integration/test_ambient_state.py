@@ -13,7 +13,6 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import BarsAndStripes, ImageDataModule
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.likelihood import (
     Ais,
     log_likelihood_or_bound,
@@ -33,7 +32,7 @@ from memcomp_lightning.modules import (
     evaluate,
 )
 from memcomp_lightning.objective import Centring, contrast
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, from_model
+from memcomp_lightning.problems import from_model
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -48,6 +47,8 @@ from memcomp_lightning.samplers import (
     Quench,
     positive_phase,
 )
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 
 @contextlib.contextmanager

@@ -22,7 +22,6 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from memcomp_lightning import defaults
 from memcomp_lightning.data import SparseRows
-from memcomp_lightning.dmm import DmmSolver
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.estimators import MemcompDBNClassifier, MemcompRBM, inputs
 from memcomp_lightning.interop import AnnealerSamples
@@ -38,6 +37,7 @@ from memcomp_lightning.samplers import (
     ParallelTempering,
     Quench,
 )
+from memcomp_lightning.solvers.dmm import DmmSolver
 
 ROOT = Path(__file__).parents[2]
 SMALL = [

@@ -24,7 +24,6 @@ from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import BoltzmannPretraining
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce
 from memcomp_lightning.replicas import Rates, pretrain_machine
 from memcomp_lightning.samplers import (
     CD,
@@ -39,6 +38,7 @@ from memcomp_lightning.samplers import (
     ParallelTempering,
     Quench,
 )
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce
 from memcomp_lightning.testing import check_sampler
 
 Run = Callable[..., Outcome]

@@ -359,7 +359,8 @@ def unannounced() -> None:
 
 @pytest.mark.usefixtures("unannounced")
 def test_compilation_is_said_in_one_line(capfd: pytest.CaptureFixture[str]) -> None:
-    one, other = kernel("memcomp_lightning.dmm.kernels.rows"), kernel("memcomp_lightning.qubo.search")
+    of = "memcomp_lightning.solvers"
+    one, other = kernel(f"{of}.dmm.kernels.rows"), kernel(f"{of}.kernels.branch_and_bound")
     with compilation_told("memcomp-train"):
         kernel("of.others")(1)
         assert capfd.readouterr().err == ""

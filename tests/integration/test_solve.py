@@ -12,7 +12,7 @@ import torch
 from running import Outcome, launch
 
 import memcomp_lightning
-from memcomp_lightning.qubo import FORMATS, read_problem
+from memcomp_lightning.problems import FORMATS, read_problem
 
 Solve = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"

@@ -16,9 +16,9 @@ from memcomp_lightning.cli.worth_measures import mean_gradient
 from memcomp_lightning.data import Digits, ImageDataModule, ShiftingBars
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBN, RBM, Gaussian
-from memcomp_lightning.qubo import BruteForce
 from memcomp_lightning.report.worth import Courses, read_worth, weights_path
 from memcomp_lightning.samplers import Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
+from memcomp_lightning.solvers import BruteForce
 
 Run = Callable[..., Outcome]
 KEPT = ("cd1", "cd1_long", "exact", "mode_cd_exact")

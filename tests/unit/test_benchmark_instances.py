@@ -9,7 +9,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.qubo import BruteForce
+from memcomp_lightning.solvers import BruteForce
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "solver_benchmark"))
 pytest.importorskip("numba")

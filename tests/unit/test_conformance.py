@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from memcomp_lightning.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNPretraining
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce, GibbsAnnealing, Qubo
+from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -23,6 +22,8 @@ from memcomp_lightning.samplers import (
     Quench,
 )
 from memcomp_lightning.samplers.gibbs import sweep
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
+from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
 from memcomp_lightning.types import Configurations, NegativePhase
 

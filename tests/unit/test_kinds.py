@@ -95,7 +95,7 @@ def test_other_kinds(override: str, message: str) -> None:
     "override",
     [
         "pretrain.optimizer.lr=1",
-        "solver.integrator={_target_: memcomp_lightning.dmm.Splitting}",
+        "solver.integrator={_target_: memcomp_lightning.solvers.dmm.Splitting}",
         "solver.max_steps=null",
         "data.source.threshold=0",
         "+trainer.devices=[0]",

@@ -19,17 +19,8 @@ from scipy.io import mmread
 from memcomp_lightning import __version__, rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
-from memcomp_lightning.qubo import (
-    FORMATS,
-    BruteForce,
-    ProblemFileError,
-    Qubo,
-    QuboSolution,
-    Status,
-    WeightedMaxSat,
-    read_problem,
-    write_solution,
-)
+from memcomp_lightning.problems import FORMATS, ProblemFileError, Qubo, WeightedMaxSat, read_problem
+from memcomp_lightning.solvers import Answer, BruteForce, QuboSolution, Status, write_solution
 
 DATA = Path(os.environ.get("MEMCOMP_DATA_DIR", "")) / "qubo"
 needs_qubo_files = pytest.mark.skipif(
@@ -227,7 +218,7 @@ def test_unused_variables_cost_nothing(write):
     problem = read_problem(write("a.coo", "0 9999998 -1\n"))
     assert (problem.n, problem.problem.n, problem.n_unused) == (9_999_999, 2, 9_999_997)
     solution = BruteForce().minimise(problem.problem, generator=rng.stream(0, "solver"))
-    answer = problem.answer(solution)
+    answer = Answer.of(problem, solution)
     assert answer.assignment.nonzero().flatten().tolist() == [0, 9_999_998]
     assert (answer.score, answer.optimal) == ((-1, 0), True)
     assert problem.score(answer.assignment) == problem.score(solution.best)
@@ -413,7 +404,7 @@ def test_packed_files_have_the_name_and_energies_of_the_others(write, name, text
 
 
 def test_a_packed_file_may_not_fill_the_memory(write, monkeypatch):
-    monkeypatch.setattr("memcomp_lightning.qubo.files.source.MOST_UNPACKED", 1000)
+    monkeypatch.setattr("memcomp_lightning.problems.files.source.MOST_UNPACKED", 1000)
     assert read_problem(write("a.cnf.xz", lzma.compress(b"p cnf 1 1\n1 0\n" + b" " * 900))).n == 1
     with pytest.raises(ProblemFileError, match="packed into it, expected at most so much"):
         read_problem(write("a.cnf.xz", lzma.compress(b"p cnf 1 1\n1 0\n" + b" " * 10**6)))

@@ -6,7 +6,11 @@ import re
 
 import pytest
 
-from memcomp_lightning.dmm import (
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.likelihood import Ais, ReverseAis
+from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce
+from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
@@ -18,10 +22,6 @@ from memcomp_lightning.dmm import (
     Strang,
     WarmRestart,
 )
-from memcomp_lightning.errors import SettingError
-from memcomp_lightning.likelihood import Ais, ReverseAis
-from memcomp_lightning.qubo import AlternatingDescent, BruteForce
-from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, Quench
 
 COUNT = "an integer >= 1"
 POSITIVE = "a number > 0"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from memcomp_lightning.dmm import BondField, ClauseField, DmmSolver
+from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver
 
 SOLVER = Path(__file__).parents[2] / "conf" / "solver"
 
@@ -21,7 +21,7 @@ SOLVER = Path(__file__).parents[2] / "conf" / "solver"
 )
 def test_configs_list_every_setting_with_its_default(path, kind, absent):
     config = OmegaConf.to_container(OmegaConf.load(SOLVER / path))
-    assert config.pop("_target_") == f"memcomp_lightning.dmm.{kind.__name__}"
+    assert config.pop("_target_") == f"memcomp_lightning.solvers.dmm.{kind.__name__}"
     config.pop("defaults", None)
     defaults = {field.name: field.default for field in dataclasses.fields(kind) if field.name not in absent}
     assert config == defaults

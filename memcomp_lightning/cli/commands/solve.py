@@ -21,28 +21,30 @@ from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.output import make_tolerant, say
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, check_finite, check_seed
 from memcomp_lightning.cli.table import short_path
-from memcomp_lightning.dmm import DmmSolver, default_steps
 from memcomp_lightning.errors import SettingError, require, require_choice
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.plotting import plot_trajectory
-from memcomp_lightning.qubo import (
+from memcomp_lightning.problems import (
     FORMATS,
-    Answer,
     Bipartite,
-    BranchAndBound,
-    BruteForce,
     Problem,
     ProblemFileError,
     Qubo,
-    QuboSolution,
-    QuboSolver,
-    Trajectory,
     WeightedMaxSat,
     in_full,
     read_problem,
     to_qubo,
+)
+from memcomp_lightning.solvers import (
+    Answer,
+    BranchAndBound,
+    BruteForce,
+    QuboSolution,
+    QuboSolver,
+    Trajectory,
     write_solution,
 )
+from memcomp_lightning.solvers.dmm import DmmSolver, default_steps
 
 COMMAND = "memcomp-solve"
 
@@ -229,7 +231,7 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
             picture = _draw(folder, problem.name, solution.trajectory)
     except OSError as error:
         lost = f"folder {folder} cannot be written ({error.strerror}): choose another with hydra.run.dir=PATH"
-    answer = problem.answer(solution)
+    answer = Answer.of(problem, solution)
     say(f"\n{_table(problem, answer, solution.wall_time_s)}\n")
     holds = "" if problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
     if written:

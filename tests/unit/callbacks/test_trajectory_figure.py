@@ -9,10 +9,11 @@ from foreign import TheirChains, events_in, fit, tensorboard
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import TrajectoryFigure, trajectory_figure
-from memcomp_lightning.dmm import DmmSolver, Recording
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
-from memcomp_lightning.qubo import AlternatingDescent, from_model
+from memcomp_lightning.problems import from_model
+from memcomp_lightning.solvers import AlternatingDescent
+from memcomp_lightning.solvers.dmm import DmmSolver, Recording
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),

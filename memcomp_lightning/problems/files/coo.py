@@ -1,0 +1,46 @@
+"""The coordinate list of dimod: ``i j bias`` counted from 0, what x is and a constant in comments."""
+
+import re
+
+from memcomp_lightning.problems.files.comments import IS, comments, constant, said
+from memcomp_lightning.problems.files.objective import Parsed, Terms, from_terms
+from memcomp_lightning.problems.files.source import MOST_VARIABLES, Source, quoted
+from memcomp_lightning.problems.files.table import Table
+
+_VARTYPE = re.compile(rf"\bvar[-_ ]?type\b{IS}(?:dimod\.)?(?:vartype\.)?(?P<value>spin|binary)\b", re.IGNORECASE)
+_NAMES_VARTYPE = re.compile(r"var[-_ ]?type", re.IGNORECASE)
+_SPINS = re.compile(r"\bspins?\b|\bising\b", re.IGNORECASE)
+_OTHER = re.compile(r"[\"']?\b([A-Za-z_][\w-]*)[\"']?\s*[:=]\s*([^\s,;}]+)", re.ASCII)
+
+
+def parse(source: Source, maximise: bool) -> Parsed:
+    """``i j bias`` with x in {0, 1}, or s = 2 x - 1 in {-1, 1}; i = j is linear.
+
+    dimod writes what x is into a comment and leaves the constant of a model out; ``# offset=3`` gives one. Spins
+    give one of their own when s becomes x: with it the energy is that of the file for every state.
+    """
+    lines = source.lines()
+    vartype = said(source, lines, _VARTYPE, _NAMES_VARTYPE, _TYPES)
+    offset = constant(source, lines)
+    if vartype is None and (spins := next((entry for entry in comments(lines) if _SPINS.search(entry[1])), None)):
+        raise source.fault(quoted(spins[1]), f"also a comment {_TYPES}", spins[0])
+    table = Table.read(source, lines, 0, (3,))
+    if not len(table.values) and vartype is None:
+        raise source.fault("no entries", "lines 'i j bias'")
+    i, j = table.pairs(0, MOST_VARIABLES - 1, "variables")
+    kind = (vartype or "BINARY").upper()
+    numbers = table.numbers(offset or "0")
+    terms = Terms("spin" if kind == "SPIN" else "product", i, j, numbers)
+    n = 1 + max(int(i.max(initial=-1)), int(j.max(initial=-1)))
+    remarks = [] if len(table.values) else ["There are no entries: the sum is empty."]
+    remarks += [] if offset is None else [f"The offset {offset} is counted."]
+    remarks += [
+        f"Line {at}: {quoted(match[0])} stands in a comment and is not read."
+        for at, text in comments(lines)
+        for match in _OTHER.finditer(text)
+        if not _NAMES_VARTYPE.fullmatch(match[1]) and match[1].lower() not in ("offset", "constant")
+    ]
+    return from_terms(source, f"{kind} energy", n, terms, maximised=maximise, remarks=remarks)
+
+
+_TYPES = "'# vartype=SPIN' or '# vartype=BINARY'"

@@ -1,0 +1,49 @@
+"""An RBM as numpy arrays in an ``.npz`` archive."""
+
+import io
+import zipfile
+import zlib
+
+import numpy as np
+import torch
+
+from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.problems.files.objective import Objective, Parsed, RbmEnergy
+from memcomp_lightning.problems.files.source import Source
+from memcomp_lightning.problems.from_model import from_model
+
+
+def parse(source: Source, maximise: bool) -> Parsed:
+    """Arrays ``weight (n_hidden, n_visible)``, ``b (n_visible,)`` and ``c (n_hidden,)``; x = (v, h)."""
+    try:
+        with np.load(io.BytesIO(source.data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in ("weight", "b", "c") if name in archive.files}
+            names = ", ".join(map(repr, archive.files)) or "no arrays"
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        cause = str(error).partition("\n")[0]
+        raise source.fault(f"no readable arrays ({cause})", "an .npz archive of numpy.savez") from error
+    if len(arrays) < 3:
+        raise source.fault(names, "the arrays 'weight', 'b' and 'c'")
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+            raise source.fault(f"{name} of type {array.dtype} with entries that are not", "finite numbers")
+    weight, b, c = (arrays[name] for name in ("weight", "b", "c"))
+    if weight.ndim != 2 or 0 in weight.shape:
+        raise source.fault(f"weight of shape {weight.shape}", "(n_hidden, n_visible), both >= 1")
+    for name, array, size in (("b", b, weight.shape[1]), ("c", c, weight.shape[0])):
+        if array.shape != (size,):
+            raise source.fault(f"{name} of shape {array.shape}", f"({size},), as weight is {weight.shape}")
+    double = {name: array.astype(np.float64) for name, array in arrays.items()}
+    for name, array in arrays.items():
+        if array.dtype.kind in "iu" and not (double[name].astype(object) == array.astype(object)).all():
+            raise source.fault(
+                f"{name} of type {array.dtype} with integers beyond 2^53", "numbers that float64 holds"
+            )
+    with np.errstate(over="ignore"):
+        size = sum(float(np.abs(array).sum()) for array in double.values())
+    if not np.isfinite(4 * size):
+        raise source.fault("numbers whose sums are infinite in float64", "smaller ones")
+    rbm = RBM(n_visible=len(b), n_hidden=len(c)).double()
+    rbm.load_state_dict({name: torch.from_numpy(array) for name, array in double.items()})
+    n = len(b) + len(c)
+    return Parsed(from_model(rbm), Objective("E(v, h)", RbmEnergy(**double)), n, np.arange(n))

@@ -1,0 +1,155 @@
+"""Problems from files."""
+
+import difflib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.problems.files.formats import FORMATS, guess
+from memcomp_lightning.problems.files.objective import ClauseList, Objective, Score
+from memcomp_lightning.problems.files.source import ProblemFileError, Source, stem, unpacked
+from memcomp_lightning.problems.maxsat import WeightedMaxSat
+from memcomp_lightning.problems.qubo import Qubo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """A problem and the file that it comes from.
+
+    Attributes:
+        problem: What to minimise, in float64, over those variables that the file uses.
+        path: The file.
+        format: Its format, a key of :data:`FORMATS`.
+        objective: What the file's authors count.
+        n: Number of variables of the file.
+        variables: ``(n_used,)`` int64, the variables of ``problem`` among those of the file, counted from 0.
+        remarks: What a person should know of how the file was read, a sentence each.
+        integers: ``problem`` as integers, for solvers that prove; None where int64 does not hold its sums, or for
+            clauses of three literals and more.
+        resolved: Whether energies that differ do so in float64.
+    """
+
+    problem: Qubo | WeightedMaxSat
+    path: Path
+    format: str
+    objective: Objective
+    n: int
+    variables: Tensor
+    remarks: tuple[str, ...] = ()
+    integers: Qubo | None = None
+    resolved: bool = True
+
+    @property
+    def name(self) -> str:
+        """The file's name without its suffixes."""
+        return stem(self.path).stem
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """How many variables, and couplings or clauses."""
+        if not isinstance(self.objective.counting, ClauseList):
+            return {"variables": self.n, "couplings": math.prod(self.problem.graph.edge_shape)}
+        n_hard = self.objective.counting.n_hard
+        sizes = {"variables": self.n, "clauses": len(self.objective.counting.hard)}
+        return {**sizes, "hard_clauses": n_hard} if n_hard else sizes
+
+    @property
+    def n_unused(self) -> int:
+        """Number of variables that the file does not use: any value of theirs does."""
+        return self.n - self.problem.n
+
+    def expand(self, x: Tensor) -> Tensor:
+        """A state of the problem's variables ``(n_used,)`` as one of the file's ``(n,)``; unused ones are 0."""
+        return x.new_zeros(self.n).index_copy(0, self.variables.to(x.device), x)
+
+    def score(self, x: Tensor) -> Score:
+        """Count as the file's authors do, without rounding.
+
+        Args:
+            x: One state in {0, 1}: of the file's variables ``(n,)``, or of the problem's ``(n_used,)``.
+        """
+        sizes = f"({self.n},)" + (f" or ({self.problem.n},)" if self.n_unused else "")
+        require(tuple(x.shape) in ((self.n,), (self.problem.n,)), "shape of x", tuple(x.shape), sizes)
+        used = x[self.variables.to(x.device)] if len(x) == self.n else x
+        return self.objective.counting.count((used > 0.5).cpu().numpy())
+
+
+def read_problem(path: str | Path, format: str | None = None, *, maximise: bool = False) -> Problem:
+    """Read a benchmark problem, packed with gzip, xz or bzip2 or not.
+
+    Args:
+        path: The file.
+        format: A key of :data:`FORMATS`; None is told by the file's name, of ``.txt`` and no suffix by its
+            first lines.
+        maximise: Whether the file's objective is to be maximised: files of the formats ``beasley``, ``coo``,
+            ``qbsolv`` and ``mtx`` come in both kinds, and do not say which. The energy to minimise is then minus
+            the objective.
+
+    Raises:
+        ProblemFileError: The file is missing or malformed; one line with the file, the line's number, what was
+            found and what was expected.
+        SettingError: There is no such format, or its objective is not to be maximised.
+    """
+    path = Path(path)
+    if format is not None:
+        require_choice("format", format, FORMATS)
+    source = Source(path, _read(path))
+    name = _format_of(source) if format is None else format
+    require(
+        not maximise or FORMATS[name].either_way or name == "gset",
+        "maximise",
+        maximise,
+        f"false for a file of format {name!r}",
+    )
+    parsed = FORMATS[name].parse(source, maximise)
+    return Problem(
+        problem=parsed.problem,
+        path=path,
+        format=name,
+        objective=parsed.objective,
+        n=parsed.n,
+        variables=torch.from_numpy(parsed.variables),
+        remarks=parsed.remarks,
+        integers=parsed.integers,
+        resolved=parsed.resolved,
+    )
+
+
+def _read(path: Path) -> bytes:
+    """The uncompressed bytes of a file."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise ProblemFileError(f"{path}: there is no such file. {_near(path)}") from error
+    except OSError as error:
+        raise ProblemFileError(f"{path}: cannot be read ({error.strerror}).") from error
+    return unpacked(path, data)
+
+
+def _near(path: Path) -> str:
+    """What the user may have meant by a file that does not exist."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f"The folder {folder} does not exist either."
+    names = difflib.get_close_matches(path.name, [file.name for file in folder.iterdir()], n=3, cutoff=0.3)
+    return f"Near it: {', '.join(names)}." if names else f"Nothing in the folder {folder} is called nearly so."
+
+
+def _format_of(source: Source) -> str:
+    """The format by the file's name, or by its first lines."""
+    suffix = stem(source.path).suffix.lower()
+    for name, format_ in FORMATS.items():
+        if suffix in format_.suffixes:
+            return name
+    known = "; ".join(f"{name} ({', '.join(row.suffixes)}: {row.layout})" for name, row in FORMATS.items())
+    # G1.txt and G1 are both in use; of "bench-1.0" Path takes ".0" for a suffix.
+    if suffix not in ("", ".txt") and not suffix[1:].isdecimal():
+        raise source.fault(f"the suffix {suffix}", f"one of the known ones, or format=NAME of these: {known}")
+    name_ = guess(source)
+    if name_ is None:
+        raise source.fault("first lines of no known format", f"one of these, to choose with format=NAME: {known}")
+    return name_

@@ -1,0 +1,21 @@
+"""Solvers of QUBOs behind one contract: exact ones, heuristics, and in ``dmm`` the memcomputing machine."""
+
+from memcomp_lightning.solvers.alternating_descent import AlternatingDescent
+from memcomp_lightning.solvers.annealing import GibbsAnnealing
+from memcomp_lightning.solvers.answer import Answer, write_solution
+from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status, Trajectory
+from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
+from memcomp_lightning.solvers.brute_force import BruteForce
+
+__all__ = [
+    "AlternatingDescent",
+    "Answer",
+    "BranchAndBound",
+    "BruteForce",
+    "GibbsAnnealing",
+    "QuboSolution",
+    "QuboSolver",
+    "Status",
+    "Trajectory",
+    "write_solution",
+]

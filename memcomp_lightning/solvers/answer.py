@@ -1,0 +1,161 @@
+"""What a solver found, in the terms of the file that the problem comes from."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from memcomp_lightning import __version__
+from memcomp_lightning.errors import require
+from memcomp_lightning.files import write_text
+from memcomp_lightning.problems.files.numbers import Exact, in_full
+from memcomp_lightning.problems.files.objective import Score
+from memcomp_lightning.problems.problem import Problem
+from memcomp_lightning.solvers.base import QuboSolution, Status
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A solver's answer in the terms of the problem's file, counted without rounding.
+
+    Attributes:
+        assignment: The best one, of all variables of the file, ``(n,)`` bool. Feasibility ranks before cost.
+        score: Its score.
+        energy: Its energy: the score's value, or minus it, and the penalty of unsatisfied hard clauses.
+        energies: Of each restart; None where it was not run.
+        status: Of each restart. OPTIMAL is left where it is proven and no hard clause is unsatisfied.
+    """
+
+    assignment: Tensor
+    score: Score
+    energy: Exact | float
+    energies: list[Exact | float | None]
+    status: list[Status]
+
+    @property
+    def n_run(self) -> int:
+        """Number of restarts that were run."""
+        return sum(energy is not None for energy in self.energies)
+
+    @property
+    def n_reached(self) -> int:
+        """Number of restarts that end at the best energy."""
+        return self.energies.count(self.energy)
+
+    @property
+    def optimal(self) -> bool:
+        """Whether this is proven to be the best that there is."""
+        return Status.OPTIMAL in self.status
+
+    @staticmethod
+    def of(problem: Problem, solution: QuboSolution) -> "Answer":
+        """What a solver found, in the terms of the problem's file.
+
+        Args:
+            problem: A problem from a file.
+            solution: Of ``problem.problem``, or of ``problem.integers``.
+
+        Raises:
+            SettingError: The solution is of more than one problem.
+        """
+        require(solution.energies.ndim == 1, "energies' shape", tuple(solution.energies.shape), "(n_restarts,)")
+        # Solvers return the dtype of what they were given: integers were compared as integers.
+        exact = problem.resolved or solution.assignments.dtype == torch.int64
+        scores: list[Score | None] = []
+        status: list[Status] = []
+        for x, energy, code in zip(
+            solution.assignments, solution.energies.tolist(), solution.status.tolist(), strict=True
+        ):
+            score = problem.score(x) if math.isfinite(energy) else None
+            scores.append(score)
+            proven = code == Status.OPTIMAL and score is not None
+            if proven and score is not None and score.hard_unsatisfied and exact:
+                code = Status.INFEASIBLE
+            elif proven and not exact:
+                code = Status.ROUNDED
+            status.append(Status(code))
+        energies = [None if score is None else problem.objective.energy(score) for score in scores]
+        ran = [k for k, energy in enumerate(energies) if energy is not None]
+        best = min(ran, key=lambda k: energies[k])  # type: ignore[return-value, arg-type]
+        chosen = scores[best]
+        assert chosen is not None
+        assignment = problem.expand(solution.assignments[best] > 0.5)
+        return Answer(assignment, chosen, problem.objective.energy(chosen), energies, status)
+
+
+def write_solution(
+    path: Path, problem: Problem, solution: QuboSolution, *, solver: Mapping[str, Any], seed: int
+) -> None:
+    """Write a solver's answer as JSON, whole or not at all.
+
+    Args:
+        path: Where to.
+        problem: What was solved: one problem.
+        solution: The answer to it.
+        solver: Settings of the solver, as JSON can hold them.
+        seed: The seed of its random stream.
+
+    Raises:
+        SettingError: The answer is to more than one problem.
+    """
+    answer = Answer.of(problem, solution)
+    objective = {
+        "name": problem.objective.name,
+        "direction": problem.objective.direction,
+        **_in_json("value", answer.score.value),
+    }
+    if "hard_clauses" in problem.sizes:
+        objective["hard_clauses_unsatisfied"] = answer.score.hard_unsatisfied
+    sizes = {f"n_{kind}": number for kind, number in problem.sizes.items()}
+    if problem.n_unused:
+        sizes["n_unused_variables"] = problem.n_unused
+    content = {
+        "problem": {
+            "file": str(problem.path),
+            "name": problem.name,
+            "format": problem.format,
+            **sizes,
+            **({"remarks": problem.remarks} if problem.remarks else {}),
+        },
+        **_in_json("energy", answer.energy),
+        "objective": objective,
+        "assignment": answer.assignment,
+        "restarts": {
+            "energy": [None if energy is None else _nearest(energy) for energy in answer.energies],
+            "status": [status.name for status in answer.status],
+            "steps": solution.steps.tolist(),
+        },
+        "wall_time_s": solution.wall_time_s,
+        "solver": dict(solver),
+        "seed": seed,
+        "memcomp_lightning": __version__,
+    }
+    lines = ",\n".join(f" {json.dumps(name)}: {_json(value)}" for name, value in content.items())
+    write_text(path, f"{{\n{lines}\n}}\n")
+
+
+def _json(value: object) -> str:
+    """A value as JSON; an assignment digit by digit, as it may have millions."""
+    if isinstance(value, Tensor):
+        return f"[{', '.join(map(str, value.to(torch.uint8).tolist()))}]"
+    return json.dumps(value, allow_nan=False)
+
+
+def _nearest(value: Exact | float) -> int | float:
+    """A number that JSON has: integers whole, fractions rounded to float64."""
+    whole = isinstance(value, float) and value.is_integer() and abs(value) <= 2**53
+    return int(value) if whole else float(value) if isinstance(value, Fraction) else value
+
+
+def _in_json(name: str, value: Exact | float) -> dict[str, Any]:
+    """A number, and all digits of a fraction that float64 rounds."""
+    written: dict[str, Any] = {name: _nearest(value)}
+    if isinstance(value, Fraction) and Fraction(repr(float(value))) != value:
+        written[f"{name}_in_full"] = in_full(value)
+    return written

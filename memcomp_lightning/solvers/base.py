@@ -1,0 +1,112 @@
+"""What every solver of a QUBO takes and gives back, and how each restart ended."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+from torch import Generator, Tensor
+
+from memcomp_lightning.problems.qubo import Qubo
+
+
+class Status(IntEnum):
+    """How one restart of a solver ended; ``advice`` says what to do about it."""
+
+    OPTIMAL = 0
+    CONVERGED = 1
+    STEP_BUDGET = 2
+    STILL_IMPROVING = 3
+    NOT_RUN = 4
+    STALLED = 5
+    INFEASIBLE = 6
+    ROUNDED = 7
+
+    @property
+    def advice(self) -> str:
+        """One sentence for a person."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OPTIMAL: "Every state was examined: this is the minimum.",
+    Status.CONVERGED: "No block of variables improves this assignment; more restarts may find a lower one.",
+    Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
+    Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
+    Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
+    Status.INFEASIBLE: "Every state was examined: none satisfies all hard clauses; this one breaks the fewest.",
+    Status.ROUNDED: "Every state was examined, but float64 rounds sums of these numbers: another may be lower.",
+    Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
+}
+
+
+class Trajectory(NamedTuple):
+    """What a solver passed through, recorded at intervals.
+
+    Attributes:
+        time: Machine time of each record, ``(*problems, n_restarts, n_records)``.
+        unsatisfied_weight: Total weight of unsatisfied clauses then, same shape.
+        assignments: The digital state then, ``(*problems, n_restarts, n_records, n)``, bool.
+        dwell: Machine time that the record stands for, ``(*problems, n_restarts, n_records)``.
+    """
+
+    time: Tensor
+    unsatisfied_weight: Tensor
+    assignments: Tensor
+    dwell: Tensor
+
+    def low_energy_dwell(self) -> Tensor:
+        """``dwell`` of the low-energy stretch of each restart: 0 before its weight first falls to its median."""
+        weight = self.unsatisfied_weight
+        reached = (weight <= weight.median(-1, keepdim=True).values).cummax(-1).values
+        return self.dwell * reached
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuboSolution:
+    """Answers of all restarts.
+
+    Attributes:
+        assignments: ``(*problems, n_restarts, n)`` in {0, 1}, dtype of the problem.
+        energies: ``(*problems, n_restarts)`` float64, computed from the assignments; infinite where not run.
+        status: ``(*problems, n_restarts)`` int64, values of :class:`Status`.
+        steps: ``(*problems, n_restarts)`` int64, integration steps or sweeps done.
+        wall_time_s: Seconds for all problems and restarts together.
+        trajectory: The recorded trajectory, if the solver was asked for it.
+    """
+
+    assignments: Tensor
+    energies: Tensor
+    status: Tensor
+    steps: Tensor
+    wall_time_s: float
+    trajectory: Trajectory | None = None
+
+    @property
+    def best_energy(self) -> Tensor:
+        """Lowest energy over the restarts, ``(*problems,)`` float64."""
+        return self.energies.min(-1).values
+
+    @property
+    def best(self) -> Tensor:
+        """Assignment of lowest energy, ``(*problems, n)``."""
+        index = self.energies.argmin(-1)[..., None, None]
+        return self.assignments.take_along_dim(index, dim=-2).squeeze(-2)
+
+    def messages(self) -> dict[str, int]:
+        """How many restarts ended in each way, keyed by name and advice."""
+        values, counts = self.status.unique(return_counts=True)
+        return {
+            f"{Status(int(value)).name}: {Status(int(value)).advice}": int(count)
+            for value, count in zip(values, counts, strict=True)
+        }
+
+
+class QuboSolver(Protocol):
+    """Anything that looks for minima of a :class:`Qubo`, several problems and restarts a call.
+
+    A solver that stops early says so in ``status``; it does not raise inside a training run.
+    """
+
+    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+        """Return the assignments found, one a restart."""
+        ...

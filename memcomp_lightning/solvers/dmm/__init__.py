@@ -1,0 +1,31 @@
+"""Digital memcomputing machines: vector fields, integrators, kernels and the solver."""
+
+from memcomp_lightning.solvers.dmm.base import Recording, VectorField
+from memcomp_lightning.solvers.dmm.bond import BondField
+from memcomp_lightning.solvers.dmm.clause import ClauseField
+from memcomp_lightning.solvers.dmm.integrate import (
+    AdaptiveEuler,
+    ExactShortTerm,
+    Heun,
+    Integrator,
+    Splitting,
+    Strang,
+)
+from memcomp_lightning.solvers.dmm.solver import DmmSolver, WarmRestart, default_quench, default_steps
+
+__all__ = [
+    "AdaptiveEuler",
+    "BondField",
+    "ClauseField",
+    "DmmSolver",
+    "ExactShortTerm",
+    "Heun",
+    "Integrator",
+    "Recording",
+    "Splitting",
+    "Strang",
+    "VectorField",
+    "WarmRestart",
+    "default_quench",
+    "default_steps",
+]

@@ -1,0 +1,76 @@
+"""What a memory dynamics is: a problem in its units, a state, the time derivative, the bounds."""
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+
+from torch import Tensor
+
+from memcomp_lightning.problems.maxsat import WeightedMaxSat
+from memcomp_lightning.problems.qubo import Qubo
+
+if TYPE_CHECKING:
+    from memcomp_lightning.solvers.dmm.integrate import Integrator
+
+MachineT = TypeVar("MachineT")
+StateT = TypeVar("StateT", bound="HasVoltage")
+
+
+class HasVoltage(Protocol):
+    """A state of the machine; voltages are always part of it."""
+
+    @property
+    def voltage(self) -> Tensor:
+        """``(*problems, n_restarts, n)`` in [-1, 1]; > 0 reads as TRUE."""
+        ...
+
+
+class VectorField(Protocol[MachineT, StateT]):
+    """One family of memory dynamics. Pure: settings are frozen, the state goes in and comes out.
+
+    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple of tensors,
+    of which those named ``...long_term`` outlive a warm restart and have their rest value at 1.
+    """
+
+    @property
+    def integrator(self) -> "Integrator":
+        """The scheme that the constants were chosen with."""
+        ...
+
+    @property
+    def noise(self) -> float:
+        """Width of the uniform noise on the voltages per square root of machine time, >= 0."""
+        ...
+
+    @property
+    def spread(self) -> float:
+        """Initial voltages are uniform in [-spread, spread], in (0, 1]."""
+        ...
+
+    def build(self, problem: Qubo | WeightedMaxSat) -> MachineT:
+        """Scale a problem into the machine's units."""
+        ...
+
+    def stability(self, machine: MachineT) -> Tensor:
+        """Factor in (0, 1] on the largest change of a voltage in a step, ``(*problems, 1)``."""
+        ...
+
+    def init(self, machine: MachineT, voltage: Tensor) -> StateT:
+        """The memories that belong to initial voltages ``(*problems, n_restarts, n)``."""
+        ...
+
+    def derivative(self, machine: MachineT, state: StateT) -> StateT:
+        """Right-hand side of the ODE, one tensor for each of the state's."""
+        ...
+
+    def bound(self, machine: MachineT, state: StateT) -> StateT:
+        """Project voltages and memories onto their intervals."""
+        ...
+
+
+class Recording(NamedTuple):
+    """What to keep of a trajectory.
+
+    Attributes:
+        every: Record each so many steps, >= 1.
+    """
+
+    every: int = 8

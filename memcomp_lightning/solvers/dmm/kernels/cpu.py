@@ -1,0 +1,369 @@
+"""The compiled kernels: hand tensors to numba and share the restarts among threads."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from memcomp_lightning.compiling import announce_compilation
+from memcomp_lightning.problems.graph import Bipartite
+from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.dmm.base import Recording
+from memcomp_lightning.solvers.dmm.bond import BondField, BondMachine
+from memcomp_lightning.solvers.dmm.clause import ClauseField, ClauseMachine
+from memcomp_lightning.solvers.dmm.integrate import Splitting
+from memcomp_lightning.solvers.dmm.kernels import common, lanes, rows
+from memcomp_lightning.solvers.dmm.kernels.common import BOND
+from memcomp_lightning.solvers.dmm.kernels.prepare import prepare
+from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start, Visited
+
+announce_compilation()
+
+Array = np.ndarray[Any, Any]
+Field = ClauseField | BondField
+Machine = ClauseMachine | BondMachine
+Steps = tuple[int, int, int, int, float]
+
+
+def run(
+    field: Field,
+    integrator: Splitting,
+    problem: Qubo | WeightedMaxSat,
+    start: Start,
+    *,
+    n_steps: int,
+    quench_every: int,
+    recording: Recording | None,
+    stall: Stall | None = None,
+    remember: bool = True,
+) -> Run:
+    """Do what ``reference.run`` does, for tensors on the CPU, in float32."""
+    every = recording.every if recording is not None else 0
+    min_steps, factor = (n_steps, 0.0) if stall is None or every else stall
+    steps = (n_steps, quench_every, every, min_steps, float(factor))
+    if isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
+        return _run_rows(field, integrator, problem, problem.graph, start, steps, remember)
+    return _run_lanes(field, integrator, problem, start, steps)
+
+
+def _run_rows(
+    field: Field,
+    integrator: Splitting,
+    problem: Qubo,
+    graph: Bipartite,
+    start: Start,
+    steps: Steps,
+    remember: bool,
+) -> Run:
+    """Two fully coupled layers, one task a restart."""
+    n_problems, n_restarts, n = start.voltage.shape
+    padded = _prepared(field, problem, graph)
+    width, height, n_first, n_second = padded.sizes
+    constants, control = _settings(field, integrator, *padded.scalars.T)
+    # The kernel divides the sum of the squared rates by the number of variables with the padding.
+    control[:, 0] *= np.sqrt(n / (width + height))
+    voltage = _pad(_array(start.voltage), n_first, width, width + height)
+    kept: list[Array] = [_array(memory) for memory in start.kept]
+    if kept:
+        matrix = kept[0].reshape(n_problems, n_restarts * n_second, n_first)
+        matrix = _pad(matrix, n_first, width, width).reshape(n_problems, n_restarts, n_second * width)
+        kept = [matrix, _pad(kept[1], n_first, width, width + height)]
+    else:
+        n_kept = n_restarts if remember else 0
+        kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in (n_second * width, width + height)]
+    arrays = (padded.kind, padded.sizes, padded.side, constants, *padded[4:])
+    out = _outputs((n_problems, n_restarts), width + height, steps)
+    state = (voltage, *kept, _seeds(start.seed))
+    work = padded.weight.size * n_restarts * steps[0]
+    _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
+
+    def unpad(x: Array) -> Array:
+        return np.concatenate((x[..., :n_first], x[..., width : width + n_second]), axis=-1)
+
+    memories = []
+    if remember:
+        of_pairs = kept[0].reshape(n_problems, n_restarts, n_second, width)
+        memories = [np.ascontiguousarray(of_pairs[..., :n_first]), unpad(kept[1])]
+    return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps)
+
+
+def _pad(x: Array, n_first: int, width: int, size: int) -> Array:
+    """Move what is behind ``n_first`` on the last axis to behind ``width``; zeros elsewhere."""
+    padded = np.zeros((*x.shape[:-1], size), np.float32)
+    padded[..., :n_first] = x[..., :n_first]
+    padded[..., width : width + x.shape[-1] - n_first] = x[..., n_first:]
+    return padded
+
+
+class _Prepared(NamedTuple):
+    """Two fully coupled layers as the rows kernel reads them; ``prepare`` says what the arrays are."""
+
+    kind: int
+    sizes: tuple[int, int, int, int]
+    side: Array
+    scalars: Array
+    weight: Array
+    unit: Array
+    coupling: Array
+    transposed: Array
+    linear: Array
+
+
+def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
+    """Scale problems into the machine's units and into those of the digital state; pad the layers."""
+    n_problems, n_first, n_second = problem.offset.shape[0], graph.n_first, graph.n_second
+    width, height = (-(-n // _VECTOR) * _VECTOR for n in (n_first, n_second))
+    weight = np.zeros((n_problems, n_second * width), np.float32)
+    coupling, transposed = (np.zeros((n_problems, height * width), np.float32) for _ in range(2))
+    unit, linear = (np.zeros((n_problems, width + height), np.float32) for _ in range(2))
+    scalars = np.empty((n_problems, 3))
+    kind = BOND if isinstance(field, BondField) else 1 - BOND
+    given = [np.ascontiguousarray(x.detach().double().numpy()) for x in (problem.coupling, problem.linear)]
+    _forget_outdated(prepare)
+    compiled: Any = prepare
+    compiled(kind, width, height, *given, weight, unit, scalars, coupling, transposed, linear)
+    side = np.where(2 * np.arange(width) < n_first, np.float32(0.5), np.float32(-0.5))
+    sizes = (width, height, n_first, n_second)
+    return _Prepared(kind, sizes, side, scalars, weight, unit, coupling, transposed, linear)
+
+
+def _run_lanes(
+    field: Field, integrator: Splitting, problem: Qubo | WeightedMaxSat, start: Start, steps: Steps
+) -> Run:
+    """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
+    machine: Any = field.build(problem)
+    one = torch.ones((), dtype=torch.float32, device="cpu")
+    scalars = (machine.pull_scale, one) if isinstance(machine, BondMachine) else (one, machine.degree)
+    flat = [_array(x).reshape(-1) for x in (field.stability(machine), *scalars)]
+    constants, control = _settings(field, integrator, *flat)
+    n_problems, n_restarts, n = start.voltage.shape
+    n_blocks, lanes_each = _blocks(n_restarts)
+    sparse = _sparse(machine, problem, n_problems)
+    voltage = _to_lanes(_array(start.voltage), n_blocks, lanes_each)
+    sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
+    kept = [_array(memory) for memory in start.kept]
+    kept = kept or [np.zeros((n_problems, n_restarts, size), np.float32) for size in sizes]
+    memories = [_to_lanes(memory, n_blocks, lanes_each) for memory in kept]
+    seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks, lanes_each)[:, :, 0])
+    out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
+    longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
+    own = (sparse.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
+    arrays = (*own, longer, sparse.digital, sparse.linear)
+    state = (voltage, *memories, seed)
+    work = (sparse.weight.size + sparse.longer_weight.size) * n_restarts * steps[0]
+    _share(lanes.integrate_all, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
+    out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
+    final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
+    return _finish(out, final[0], final[1:], steps)
+
+
+class _Sparse(NamedTuple):
+    """A problem as the lanes kernel reads it."""
+
+    kind: int
+    pairs: Array
+    weight: Array
+    polarity: Array
+    unit: Array
+    variables: Array
+    longer_polarity: Array
+    longer_weight: Array
+    digital: tuple[Array, ...]
+    linear: Array
+
+
+def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -> _Sparse:
+    """Flatten a problem and list, for each variable, its pairs and its longer clauses."""
+    pairs = np.ascontiguousarray(problem.graph.edges().cpu().numpy())
+    n, n_pairs = problem.n, pairs.shape[0]
+    if isinstance(machine, BondMachine):
+        kind, weight, unit = BOND, machine.bond, machine.field
+        polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
+        variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
+        longer_weight = np.zeros((n_problems, 0), np.float32)
+    else:
+        kind, weight, unit = 1 - BOND, machine.weight, machine.unit
+        both = [q.expand(weight.shape).reshape(n_problems, n_pairs) for q in (machine.first, machine.second)]
+        polarity = _array(torch.stack(both, dim=-1))
+        variables, longer_polarity = machine.longer_variables.numpy(), _array(machine.longer_polarity)
+        longer_weight = _array(machine.longer_weight.squeeze(-2))
+    if isinstance(problem, Qubo):
+        quadratic, block_weights = problem, []
+    else:
+        quadratic = to_qubo(problem.without_longer())
+        block_weights = [block.weight for block in problem.longer]
+    coupling, linear, clause_weight = _digital(
+        quadratic.coupling.reshape(n_problems, n_pairs),
+        quadratic.linear,
+        torch.cat(block_weights or [quadratic.linear[:, :0]], dim=-1),
+    )
+    ends = np.concatenate((pairs[:, 0], pairs[:, 1]))
+    order, offsets = _sorted(ends, n)
+    neighbours = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
+    literal_clause, literal_at = np.nonzero(longer_polarity)
+    clause_order, clause_offsets = _sorted(variables[literal_clause, literal_at], n)
+    of_pairs = (offsets, neighbours, order % max(n_pairs, 1), coupling)
+    of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
+    return _Sparse(
+        kind,
+        pairs,
+        _array(weight.reshape(n_problems, n_pairs)),
+        polarity,
+        _array(unit.squeeze(-2)),
+        variables,
+        longer_polarity,
+        longer_weight,
+        (*of_pairs, *of_clauses),
+        linear,
+    )
+
+
+def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
+    """Order that groups entries by variable, and where each variable's group begins, ``(n + 1,)``."""
+    counts = np.bincount(variable, minlength=n)
+    return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
+
+
+def _settings(
+    field: Field, integrator: Splitting, stability: Array, pull_scale: Array, degree: Array
+) -> tuple[Array, Array]:
+    """Constants of the field and of the steps in the order in which the kernels read them, a row a problem."""
+    if isinstance(field, BondField):
+        values = [field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta]
+        values += [field.short_term_min, field.long_term_max, field.short_term_start, 1.0]
+    else:
+        values = [field.alpha, field.beta, field.gamma, field.delta, field.epsilon, field.zeta]
+        values += [field.long_term_max, field.unit_pull, 0.0, 1.0]
+    constants = np.tile(np.array(values, np.float32), (len(stability), 1))
+    constants[:, 9] = pull_scale
+    if isinstance(field, ClauseField):
+        constants[:, 6] = field.most_long_term(degree)
+    limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
+    control = np.tile(np.array(limits, np.float32), (len(stability), 1))
+    control[:, 0] *= stability
+    return constants, control
+
+
+def _digital(*parts: Tensor) -> tuple[Array, ...]:
+    """Parts of the energy over a power of two a problem, so that float32 holds them and integers stay exact."""
+    sizes = [part.abs().flatten(1).double() for part in parts if part.numel()]
+    largest = torch.stack([size.amax(1) for size in sizes]).amax(0)
+    scale = torch.exp2(torch.frexp(largest.clamp(min=1e-300)).exponent.double())
+    return tuple(_array(part / scale.reshape(-1, *(1,) * (part.ndim - 1))) for part in parts)
+
+
+def _array(x: Tensor) -> Array:
+    """A tensor as a contiguous float32 array."""
+    return np.ascontiguousarray(x.detach().to(torch.float32).numpy())
+
+
+def _seeds(seed: Tensor) -> Array:
+    return seed.numpy().astype(np.uint64)
+
+
+def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Array, ...]:
+    """Best assignment, its step, the last step, record times and states."""
+    n_records = steps[0] // steps[2] if steps[2] else 0
+    return (
+        np.empty((*restarts, n), np.float32),
+        np.empty(restarts, np.int64),
+        np.empty(restarts, np.int64),
+        np.empty((*restarts, n_records)),
+        np.empty((*restarts, n_records, n), np.bool_),
+    )
+
+
+def _finish(out: tuple[Array, ...], voltage: Array, memories: list[Array], steps: Steps) -> Run:
+    best, found_at, last, times, states = (torch.from_numpy(np.ascontiguousarray(x)) for x in out)
+    kept = tuple(torch.from_numpy(memory) for memory in memories)
+    visited = Visited(times, states) if steps[2] else None
+    return Run(best > 0.5, found_at, last, torch.from_numpy(voltage), kept, visited)
+
+
+def _blocks(n_restarts: int) -> tuple[int, int]:
+    """Number of blocks of restarts and lanes of each, a multiple of ``_LANES`` up to ``_MOST_LANES``."""
+    n_blocks = -(-n_restarts // _MOST_LANES)
+    return n_blocks, -(-n_restarts // (n_blocks * _LANES)) * _LANES
+
+
+_VECTOR = 8
+"""float32 numbers in a vector register; layers are padded to a multiple."""
+
+_LANES = 16
+"""Blocks of restarts are padded to a multiple."""
+
+_MOST_LANES = 32
+"""Enough to hide the cost of a loop over the lanes, few enough to keep a variable's numbers close together."""
+
+
+def _to_lanes(x: Array, n_blocks: int, lanes_each: int) -> Array:
+    """``(n_problems, n_restarts, size)`` as ``(n_problems, n_blocks, size, lanes_each)``."""
+    restart = np.arange(n_blocks * lanes_each) % x.shape[1]
+    blocks = x[:, restart].reshape(x.shape[0], n_blocks, lanes_each, x.shape[2])
+    return np.ascontiguousarray(blocks.transpose(0, 1, 3, 2))
+
+
+def _from_lanes(x: Array, n_restarts: int) -> Array:
+    """The inverse of :func:`_to_lanes`."""
+    flat = x.transpose(0, 1, 3, 2).reshape(x.shape[0], x.shape[1] * x.shape[3], x.shape[2])
+    return np.ascontiguousarray(flat[:, :n_restarts])
+
+
+@cache
+def _pool(n_threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(n_threads, thread_name_prefix="memcomp-dmm")
+
+
+# Threads do not survive a fork: a child process makes its own.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -> None:
+    """Run items 0 to ``n_items - 1`` on as many threads as torch uses; ``work`` counts pairs x steps x restarts.
+
+    Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
+    """
+    _forget_outdated(kernel)
+    stop = np.zeros(1, np.uint8)
+    n_threads = min(torch.get_num_threads(), n_items)
+    if n_threads <= 1 and work < _SHORT:
+        kernel(0, n_items, stop, *arguments)
+        return
+    if not kernel.signatures:
+        kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
+    cuts = np.linspace(0, n_items, min(n_items, 4 * n_threads) + 1).astype(int).tolist()
+    jobs = [_pool(n_threads).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
+    try:
+        for job in jobs:
+            job.result()
+    except BaseException:
+        stop[0] = 1
+        wait(jobs)
+        raise
+
+
+_SHORT = 2e8
+"""Work of less than about a second."""
+
+
+@cache
+def _forget_outdated(kernel: Any) -> None:
+    """Remove cached code of the disk that numba would take for new.
+
+    It compiles anew when a function's own file changes, not when what it inlines does.
+    """
+    folder, module = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
+    inlined = Path(common.__file__).stat().st_mtime
+    for index in folder.glob(f"{module}.*.nbi"):
+        with suppress(FileNotFoundError):  # another process was first
+            if index.stat().st_mtime < inlined:
+                index.unlink()

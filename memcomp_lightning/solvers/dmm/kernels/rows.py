@@ -1,0 +1,382 @@
+"""Compiled kernel for two fully coupled layers: vectors run along the rows of the coupling matrix.
+
+One call integrates one restart, so that its memories stay in the cache and restarts run on threads. All
+arrays are float32; the variables are (first layer, second layer), matrices are (n_second, n_first). The
+equations are those of ``ClauseField`` and ``BondField``, the scheme is ``Splitting``.
+
+Matrices are passed flat and read at unsigned offsets: views of their rows would be counted references, which cost
+more than the arithmetic of a short row.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from memcomp_lightning.solvers.dmm.kernels.common import (
+    BOND,
+    F32,
+    FAST_MATH,
+    MAX_SWEEPS,
+    REFRESH,
+    TINY,
+    clause,
+    clause_rates,
+    copy,
+    keep_if_new,
+    uniform,
+)
+
+U64 = np.uint64
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c, dt):
+    """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive.
+
+    ``weight`` carries the polarity of the first literal as its sign. That of the second is -1 where both variables
+    are in the first halves of their layers, or in the second ones; ``side`` is 1/2 in the first half of the first
+    layer, else -1/2. ``short`` holds x_s + epsilon and ``long`` x_l - 1.
+    """
+    rates, half, row = clause_rates(c, dt), F32(0.5), U64(0)
+    for i in range(n_second):
+        h = voltage[n_first + i]
+        if U64(2) * i >= n_second:
+            h = -h
+        push = F32(0)
+        for j in range(n_first):
+            at = row + j
+            short[at], long[at], first, second = clause(
+                weight[at], voltage[j], half + side[j] * h, short[at], long[at], rates
+            )
+            drive[j] += first
+            push -= side[j] * second
+        drive[n_first + i] += -(push + push) if U64(2) * i >= n_second else push + push
+        row += n_first
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def clause_units(unit, long, voltage, drive, c, dt):
+    """Advance the memories of the unit clauses and add their pull."""
+    half, one = F32(0.5), F32(1)
+    alpha, delta, cap, pull = c[0], c[3], c[6] - one, c[7]
+    for i in range(unit.size):
+        u = unit[i]
+        sign = half if u > 0 else (-half if u < 0 else F32(0))
+        excess = dt * alpha * (half - sign * voltage[i] - delta)
+        x = long[i]
+        long[i] = min(cap, max(F32(0), x + excess * (one if excess > 0 else x)))
+        drive[i] += pull * u * (one + long[i])
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt):
+    """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
+
+    ``long`` holds Y - 1.
+    """
+    zero, one = F32(0), F32(1)
+    gamma, kappa, delta, zeta, low, cap = c[2], c[3], c[4], c[5], c[6], c[7] - one
+    growth, lift = dt * gamma - dt, dt * gamma * kappa
+    # Where X <= 1 cannot lift Y from its lower bound, Y stays there and need not be read.
+    frozen = delta <= zeta
+    row = U64(0)
+    for i in range(n_second):
+        h = voltage[n_first + i]
+        weighted = lift * h
+        push, strain = zero, zero
+        if frozen:
+            for j in range(n_first):
+                at = row + j
+                w = bond[at]
+                sign = one if w > zero else (-one if w < zero else zero)
+                x = min(one, max(low, short[at] + growth + weighted * (sign * voltage[j])))
+                short[at] = x
+                strength = abs(w) * x
+                drive[j] += w * h
+                push += w * voltage[j]
+                pull[j] += strength
+                strain += strength
+        else:
+            for j in range(n_first):
+                at = row + j
+                w, x, y = bond[at], short[at], long[at]
+                sign = one if w > zero else (-one if w < zero else zero)
+                long[at] = min(cap, max(zero, y + dt * (delta * x - zeta)))
+                x = min(one, max(low, x + growth - dt * y + weighted * (sign * voltage[j])))
+                short[at] = x
+                strength = abs(w) * x
+                drive[j] += w * h
+                push += w * voltage[j]
+                pull[j] += strength
+                strain += strength
+        drive[n_first + i] += push
+        pull[n_first + i] += strain
+        row += n_first
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def bond_fields(field, short, long, voltage, drive, pull, c, dt):
+    """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
+    zero, one = F32(0), F32(1)
+    alpha, gamma, kappa, delta, zeta, low, cap = c[0], c[2], c[3], c[4], c[5], c[6], c[7] - one
+    pull_rate = F32(2) * c[1] / c[9]
+    for i in range(field.size):
+        h = field[i]
+        sign = one if h > zero else (-one if h < zero else zero)
+        x, y = short[i], long[i]
+        long[i] = min(cap, max(zero, y + dt * (delta * x - zeta)))
+        short[i] = min(one, max(low, x + dt * (gamma * (one + kappa * sign * voltage[i]) - one - y)))
+        drive[i] = alpha * (drive[i] + h) - pull_rate * (pull[i] + abs(h) * short[i]) * voltage[i]
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
+    """Write x_s(0) + epsilon = C(0) + epsilon."""
+    half, row = F32(0.5), U64(0)
+    for i in range(n_second):
+        h = voltage[n_first + i]
+        if U64(2) * i >= n_second:
+            h = -h
+        for j in range(n_first):
+            false_first = half - math.copysign(half, weight[row + j]) * voltage[j]
+            short[row + j] = epsilon + min(false_first, half + side[j] * h)
+        row += n_first
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def flip(n_first, n_second, coupling, transposed, x, field, i):
+    """Flip one variable; return the change of energy."""
+    change = F32(1) - F32(2) * x[i]
+    gain = change * field[i]
+    x[i] += change
+    if i < n_first:
+        row = i * n_second
+        for j in range(n_second):
+            field[n_first + j] += change * transposed[row + j]
+    else:
+        row = (i - n_first) * n_first
+        for j in range(n_first):
+            field[j] += change * coupling[row + j]
+    return gain
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def local_fields(n_first, n_second, coupling, linear, x, field):
+    """Write the local fields of a digital state from scratch; return its energy."""
+    energy, row = 0.0, U64(0)
+    for j in range(n_first + n_second):
+        field[j] = linear[j]
+        energy += linear[j] * x[j]
+    for i in range(n_second):
+        total, on = F32(0), x[n_first + i]
+        for j in range(n_first):
+            total += coupling[row + j] * x[j]
+            field[j] += coupling[row + j] * on
+        field[n_first + i] += total
+        energy += total * on
+        row += n_first
+    return energy
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def quench(n_first, n_second, coupling, transposed, x, field, found):
+    """Flip single variables, layer by layer, as long as each flip lowers the energy; return the change.
+
+    ``found`` is scratch: the variables of a layer that want to flip. They are not coupled to each other.
+    """
+    total, one, two, n_resting = 0.0, F32(1), F32(2), 0
+    for sweep in range(2 * MAX_SWEEPS):
+        begin, end = (U64(0), n_first) if sweep % 2 == 0 else (n_first, n_first + n_second)
+        n_eager = 0
+        for i in range(begin, end):
+            n_eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
+        n_resting = n_resting + 1 if n_eager == 0 else 0
+        if n_resting == 2:
+            break
+        if n_eager > 0:
+            # Without branches, of which every other one would be a surprise.
+            k = U64(0)
+            for i in range(begin, end):
+                found[k] = i
+                k += U64(1) if (one - two * x[i]) * field[i] < 0 else U64(0)
+            for m in range(k):
+                total += flip(n_first, n_second, coupling, transposed, x, field, found[m])
+    return total
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def read_out(n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found):
+    """Bring the digital state and its fields up to the voltages; return its energy and how many bits changed."""
+    half, n, n_changed = F32(0.5), n_first + n_second, 0
+    for i in range(n):
+        n_changed += 1 if (voltage[i] > 0) != (x[i] > half) else 0
+    if MANY * n_changed > n:
+        for i in range(n):
+            x[i] = F32(1) if voltage[i] > 0 else F32(0)
+        energy = local_fields(n_first, n_second, coupling, linear, x, field)
+    elif n_changed > 0:
+        k = U64(0)
+        for i in range(n):
+            found[k] = i
+            k += U64(1) if (voltage[i] > 0) != (x[i] > half) else U64(0)
+        for m in range(k):
+            energy += flip(n_first, n_second, coupling, transposed, x, field, found[m])
+    return energy, n_changed
+
+
+MANY = 3
+"""Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
+
+
+@njit(nogil=True, cache=True)
+def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, last, times, states):
+    """Integrate the restarts numbered ``begin`` to ``end - 1``, problem by problem.
+
+    Layers are padded to whole vectors with variables that nothing moves; ``n_first`` and ``n_second`` count them.
+
+    Args:
+        begin: First restart.
+        end: Behind the last restart.
+        stop: One number; anything but 0 ends the integration at the next step.
+        problem: (kind, sizes, side, constants, weight, unit, coupling, transposed, linear), the last six a problem
+            each, matrices flat; sizes are n_first, n_second, and how many of both are no padding.
+        control: (change, dt_min, dt_max, noise, lag), a problem each.
+        start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``; without restarts, the
+            memories begin at rest and are not returned.
+        steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
+        best: Out, ``(n_problems, n_restarts, n)``.
+        found_at: Out, the step at which it was met, ``(n_problems, n_restarts)``; 0 for the initial state.
+        last: Out, the number of steps done, ``(n_problems, n_restarts)``.
+        times: Out, ``(n_problems, n_restarts, n_records)``.
+        states: Out, ``(n_problems, n_restarts, n_records, n)``.
+    """
+    kind, sizes, side, constants, weight, unit, coupling, transposed, linear = problem
+    n_first, n_second, columns, rows = sizes
+    sizes = (U64(n_first), U64(n_second), U64(columns), U64(rows))
+    voltage, long, unit_long, seed = start
+    n_restarts = voltage.shape[1]
+    fresh = long.shape[1] == 0
+    at_rest, unit_at_rest = np.empty(weight.shape[1], F32), np.empty(unit.shape[1], F32)
+    for item in range(begin, end):
+        if stop[0] != 0:
+            return
+        p, r = item // n_restarts, item % n_restarts
+        if fresh:
+            at_rest[:] = 0
+            unit_at_rest[:] = 0
+        found_at[p, r], last[p, r] = integrate(
+            (kind, sizes, side, weight[p], unit[p], coupling[p], transposed[p], linear[p]),
+            constants[p],
+            control[p],
+            voltage[p, r],
+            at_rest if fresh else long[p, r],
+            unit_at_rest if fresh else unit_long[p, r],
+            seed[p, r],
+            steps,
+            stop,
+            best[p, r],
+            times[p, r],
+            states[p, r],
+        )
+
+
+@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, best, times, states):
+    """Integrate one restart; return the step at which ``best`` was met, and the last step.
+
+    Args:
+        problem: (kind, sizes, side, weight or bond, unit or field, coupling, its transpose, linear).
+        c: Constants of the field, in the order of ``cpu._constants``.
+        control: (change, dt_min, dt_max, noise, lag).
+        voltage: ``(n,)``; initial values in, final values out.
+        long: Long-term memories less 1, in and out.
+        unit_long: Those of the unit clauses or fields, ``(n,)``, in and out.
+        seed: Of the noise.
+        steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
+            quench. The restart ends at a reading from step min_steps + stall found_at on.
+        stop: One number; anything but 0 ends the integration.
+        best: ``(n,)``, out: the assignment of lowest energy.
+        times: ``(n_records,)``, out.
+        states: ``(n_records, n)``, out.
+    """
+    kind, sizes, side, weight, unit, coupling, transposed, linear = problem
+    n_first, n_second, columns, rows = sizes
+    n_steps, quench_every, every, min_steps, stall = steps
+    half, one = F32(0.5), F32(1)
+    n = voltage.size
+    drive, pull, before = np.zeros(n, F32), np.zeros(n, F32), np.zeros(n, F32)
+    unit_short = np.full(n, c[8], F32)
+    if kind == BOND:
+        short = np.full(weight.size, c[8], F32)
+    else:
+        short = np.empty(weight.size, F32)
+        start_short(n_first, rows, weight, side, short, voltage, c[4])
+    x, field = np.empty(n, F32), np.empty(n, F32)
+    tried, tried_field, found = np.empty(n, F32), np.empty(n, F32), np.empty(n + 1, np.uint64)
+    for i in range(n):
+        x[i] = one if voltage[i] > 0 else F32(0)
+    energy = local_fields(n_first, n_second, coupling, linear, x, field)
+    lowest, found_at, elapsed = 1e300, 0, 0.0
+    dt, changed, n_reads, counter = F32(0), True, 0, U64(0)
+    for step in range(n_steps + 1):
+        recorded = every > 0 and step > 0 and step % every == 0
+        reads = quench_every == 0 or step % quench_every == 0
+        if step > 0 and (reads or recorded):
+            energy, n_changed = read_out(
+                n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found
+            )
+            changed = changed or n_changed > 0
+            n_reads += 1
+            if n_reads % REFRESH == 0:
+                energy = local_fields(n_first, n_second, coupling, linear, x, field)
+        if reads and changed:
+            if energy < lowest:
+                lowest = energy
+                if keep_if_new(x, best) or step == 0:
+                    found_at = step
+            if quench_every > 0:
+                copy(x, tried)
+                copy(field, tried_field)
+                reached = energy + quench(n_first, n_second, coupling, transposed, tried, tried_field, found)
+                if reached < lowest:
+                    lowest = reached
+                    if keep_if_new(tried, best) or step == 0:
+                        found_at = step
+            changed = False
+        if recorded:
+            times[step // every - 1] = elapsed
+            for i in range(n):
+                states[step // every - 1, i] = x[i] > half
+        # One pass moves the memories by the step that led here and finds the rate of the voltages.
+        drive[:] = 0
+        if kind == BOND:
+            pull[:] = 0
+            bond_pass(n_first, rows, weight, short, long, voltage, drive, pull, c, dt)
+            bond_fields(unit, unit_short, unit_long, voltage, drive, pull, c, dt)
+        else:
+            clause_pass(n_first, rows, weight, side, short, long, voltage, drive, c, dt)
+            clause_units(unit, unit_long, voltage, drive, c, dt)
+        if step == n_steps or stop[0] != 0 or (reads and step >= min_steps + stall * found_at):
+            break
+        lag = control[4] if step > 0 else F32(0)
+        size = F32(0)
+        for i in range(n):
+            rate = drive[i]
+            drive[i] += lag * (before[i] - rate)
+            before[i] = rate
+            size += drive[i] * drive[i]
+        dt = min(control[2], max(control[1], control[0] / max(F32(math.sqrt(size / F32(n))), TINY)))
+        for i in range(n):
+            voltage[i] += dt * drive[i]
+        if control[3] > 0:
+            width = control[3] * F32(math.sqrt(dt))
+            for i in range(columns):
+                voltage[i] += width * uniform(seed, counter + i)
+            for i in range(rows):
+                voltage[n_first + i] += width * uniform(seed, counter + columns + i)
+            counter += columns + rows
+        for i in range(n):
+            voltage[i] = min(one, max(-one, voltage[i]))
+        elapsed += dt
+    return found_at, step

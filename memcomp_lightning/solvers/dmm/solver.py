@@ -1,0 +1,370 @@
+"""The digital memcomputing machine as a solver of QUBO and weighted MAX-SAT."""
+
+import dataclasses
+import importlib.util
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import require, require_choice, require_count, require_parts
+from memcomp_lightning.problems.graph import Bipartite, EdgeList
+from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.base import QuboSolution, Status, Trajectory
+from memcomp_lightning.solvers.dmm.base import Recording, VectorField
+from memcomp_lightning.solvers.dmm.bond import BondField
+from memcomp_lightning.solvers.dmm.clause import ClauseField
+from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
+from memcomp_lightning.solvers.dmm.kernels import reference
+from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class WarmRestart:
+    """A restart that goes on from where the last one of its row ended.
+
+    Attributes:
+        keep: Share of the long-term memory that is kept, in [0, 1].
+        spread: Width of the uniform kick on the final voltages, in (0, 2]; 2 forgets them.
+    """
+
+    keep: float = 0.5
+    spread: float = 0.5
+
+    def __post_init__(self) -> None:
+        require(0 <= self.keep <= 1, "keep", self.keep, "a number in [0, 1]")
+        require(0 < self.spread <= 2, "spread", self.spread, "a number in (0, 2]")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DmmSolver:
+    """Integrate a memory dynamics from random initial conditions and keep the best assignment met.
+
+    QUBO -> weighted MAX-SAT -> ODE -> assignment (Manukian et al. 2019, Fig. 3). Restarts run side by side,
+    ``patience`` of them at a time; the rule is the paper's, checked after each such group: stop once
+    ``patience`` restarts have passed without a better assignment.
+
+    Attributes:
+        field: The vector field.
+        integrator: The scheme of one step; None takes the one that the field's constants were chosen with.
+        n_restarts: Most restarts a problem, >= 1 (the paper: 28).
+        patience: Restarts without a better assignment after which a problem is done, 1 to n_restarts; None
+            runs all restarts at once.
+        max_steps: Most integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
+        stall: A restart ends early once it has done :func:`default_min_steps` and this many steps more for each
+            that its best assignment took, > 0; None lets all run for ``max_steps``. Recorded ones always do.
+        quench_every: Each so many steps the digital state is read, and a copy of it descends by single flips;
+            the machine does not feel it. 0 reads at every step, without a descent. None takes
+            :func:`default_quench` of the problem.
+        warm: How later groups begin; None draws new voltages with memories at rest.
+        record: Records trajectories, for the time average and for plots; None does not.
+        kernel: "compiled" for the CPU, "reference" in plain torch for any device, field and integrator, or
+            "auto": compiled where it can be.
+
+    >>> from memcomp_lightning import rng
+    >>> qubo = Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))
+    >>> DmmSolver(max_steps=50).minimise(qubo, generator=rng.stream(0, "solver")).best_energy.item()
+    -1.0
+    """
+
+    field: VectorField[Any, Any] = dataclasses.field(default_factory=ClauseField)
+    integrator: Integrator | None = None
+    n_restarts: int = 28
+    patience: int | None = None
+    max_steps: int | None = None
+    stall: float | None = 2.0
+    quench_every: int | None = None
+    warm: WarmRestart | None = None
+    record: Recording | None = None
+    kernel: Literal["auto", "compiled", "reference"] = "auto"
+
+    def __post_init__(self) -> None:
+        parts = ("integrator", "noise", "spread", "build", "stability", "init", "derivative", "bound")
+        require_parts("field", self.field, "vector field", parts)
+        if self.integrator is not None:
+            require_parts("integrator", self.integrator, "integrator", ("step",))
+        require_count("n_restarts", self.n_restarts)
+        for name, smallest in (("max_steps", 1), ("patience", 1), ("quench_every", 0)):
+            if getattr(self, name) is not None:
+                require_count(name, getattr(self, name), smallest)
+        if self.stall is not None:
+            require(0 < self.stall < math.inf, "stall", self.stall, "a number > 0, or null")
+        if self.patience is not None:
+            require(
+                self.patience <= self.n_restarts,
+                "patience",
+                self.patience,
+                f"an integer from 1 to n_restarts = {self.n_restarts}, or null",
+            )
+        if self.warm is not None:
+            require_parts("warm", self.warm, "WarmRestart", ("keep", "spread"))
+            require(
+                self.patience is not None and self.n_restarts % self.patience == 0,
+                "warm",
+                self.warm,
+                f"used with a patience that divides n_restarts = {self.n_restarts}",
+                f"Set patience (now {self.patience}): so many restarts run at a time, later ones go on from them.",
+            )
+        if self.record is not None:
+            require_parts("record", self.record, "Recording", ("every",))
+            require_count("record.every", self.record.every)
+            if self.max_steps is not None:
+                require(
+                    self.record.every <= self.max_steps,
+                    "record.every",
+                    self.record.every,
+                    f"an integer from 1 to max_steps = {self.max_steps}",
+                )
+        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
+        if self.kernel == "compiled":
+            obstacle = self._obstacle("cpu")
+            require(obstacle is None, "kernel", self.kernel, "'auto' or 'reference' here", obstacle or "")
+
+    def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: Generator) -> QuboSolution:
+        """Return the best assignment of each restart.
+
+        Args:
+            problem: One or many problems of one shape, ``(*problems, ...)``.
+            generator: For the initial voltages and the noise.
+        """
+        begin = time.perf_counter()
+        flat = _flatten(_without_zeros(problem))
+        n_problems, device = flat.offset.shape[0], flat.offset.device
+        n_steps = self.max_steps or default_steps(flat)
+        group_size = self.patience or self.n_restarts
+        parts, shape = list[_Part](), (n_problems, self.n_restarts)
+        active = torch.arange(n_problems, device=device)
+        lowest = torch.full((n_problems,), torch.inf, dtype=torch.float64, device=device)
+        lowest_at = torch.zeros(n_problems, dtype=torch.int64, device=device)
+        before: Run | None = None
+        for done in range(0, self.n_restarts, group_size):
+            group = slice(done, min(done + group_size, self.n_restarts))
+            part = flat if len(active) == n_problems else _select(flat, active)
+            start = self._start(part, group.stop - group.start, before, generator)
+            run = self._run(part, start, n_steps)
+            energies = part.energy(run.best)
+            visited = run.visited and _trajectory(part, run.visited.time, run.visited.states)
+            parts.append(_Part(active, group, run, energies, visited))
+            if group.stop == self.n_restarts:
+                break
+            found, at = energies.min(-1)
+            lowest_at[active] = torch.where(found < lowest[active], done + at, lowest_at[active])
+            lowest[active] = torch.minimum(found, lowest[active])
+            going_on = group.stop - 1 - lowest_at[active] < group_size
+            active = active[going_on]
+            if not active.numel():
+                break
+            if self.warm is not None:
+                before = run._replace(voltage=run.voltage[going_on], kept=tuple(m[going_on] for m in run.kept))
+
+        def whole(pick: Callable[[_Part], Tensor], elsewhere: float = 0) -> Tensor:
+            joined = _join([(part.problems, part.restarts, pick(part)) for part in parts], shape, elsewhere)
+            return joined.reshape(*problem.problems, *joined.shape[1:])
+
+        steps, found_at = whole(lambda part: part.run.steps), whole(lambda part: part.run.found_at)
+        status = torch.where(steps < n_steps, Status.STALLED, Status.STEP_BUDGET)
+        status = status.masked_fill(found_at > 0.9 * n_steps, Status.STILL_IMPROVING)
+        energies = whole(lambda part: part.energies, torch.inf)
+        trajectory = None
+        if self.record is not None and parts[0].visited is not None:
+            columns = range(len(Trajectory._fields))
+            trajectory = Trajectory(*(whole(lambda part, k=k: part.visited[k]) for k in columns))  # type: ignore[misc]
+        return QuboSolution(
+            assignments=whole(lambda part: part.run.best).to(start.voltage.dtype),
+            energies=energies,
+            status=status.masked_fill(energies.isinf(), Status.NOT_RUN),
+            steps=steps,
+            wall_time_s=time.perf_counter() - begin,
+            trajectory=trajectory,
+        )
+
+    def _start(
+        self, problem: Qubo | WeightedMaxSat, n_restarts: int, before: Run | None, generator: Generator
+    ) -> Start:
+        """New voltages with memories at rest, or a kick to where the last restarts ended."""
+        like = problem.linear if isinstance(problem, Qubo) else problem.unit
+        shape = (problem.offset.shape[0], n_restarts)
+        kick = 2 * rng.uniform((*shape, problem.n), generator=generator, like=like) - 1
+        seed = torch.randint(2**32, shape, generator=generator, device=generator.device).to(like.device)
+        if self.warm is None or before is None:
+            return Start(self.field.spread * kick, (), seed)
+        voltage = (before.voltage.to(like.dtype) + self.warm.spread * kick).clamp(-1, 1)
+        return Start(voltage, tuple(self.warm.keep * memory for memory in before.kept), seed)
+
+    def _run(self, problem: Qubo | WeightedMaxSat, start: Start, n_steps: int) -> Run:
+        """Run the kernel that the settings ask for."""
+        integrator = self.integrator or self.field.integrator
+        obstacle = None if self.kernel == "reference" else self._obstacle(start.voltage.device.type)
+        kernel: Callable[..., Run] = reference.run
+        if obstacle is not None:
+            _say_once(obstacle)
+        elif self.kernel != "reference":
+            from memcomp_lightning.solvers.dmm.kernels import cpu
+
+            kernel = cpu.run
+        return kernel(
+            self.field,
+            integrator,
+            problem,
+            start,
+            n_steps=n_steps,
+            quench_every=default_quench(problem) if self.quench_every is None else self.quench_every,
+            recording=self.record,
+            stall=None if self.stall is None else Stall(default_min_steps(problem), self.stall),
+            remember=self.warm is not None,
+        )
+
+    def _obstacle(self, device: str) -> str | None:
+        """Why the compiled kernel cannot run, and what to do; None if it can."""
+        integrator = self.integrator or self.field.integrator
+        if type(self.field) not in (ClauseField, BondField):
+            return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
+        if isinstance(self.field, ClauseField) and self.field.zeta > 0:
+            return f"zeta = {self.field.zeta:g} has no compiled kernel: set it to 0 for speed."
+        if type(integrator) is not Splitting:
+            return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
+        if device != "cpu":
+            return f"The problem is on {device}: the plain torch kernel runs there."
+        if importlib.util.find_spec("numba") is None:
+            return "numba is not installed: the plain torch kernel is many times slower. pip install numba"
+        return _import_failure()
+
+
+class _Part(NamedTuple):
+    """A group of restarts of the problems that were not done by then."""
+
+    problems: Tensor
+    restarts: slice
+    run: Run
+    energies: Tensor
+    visited: Trajectory | None
+
+
+def default_steps(problem: Qubo | WeightedMaxSat) -> int:
+    """Most steps a restart: three for each variable up to 200, then by the rule ``600 (n / 200)^(1/4)``."""
+    return max(50, round(min(3 * problem.n, 600 * math.pow(problem.n / 200, 0.25))))
+
+
+def default_min_steps(problem: Qubo | WeightedMaxSat) -> int:
+    """Steps that each restart gets before it may stall: a fifteenth of the most."""
+    return max(10, default_steps(problem) // 15)
+
+
+def default_quench(problem: Qubo | WeightedMaxSat) -> int:
+    """Steps between two readings: 1 for two coupled layers, else by the rule ``6 n / n_pairs``, at least 2.
+
+    A step costs as much as the pairs, a descent as much as the variables and its flips.
+    """
+    if isinstance(problem.graph, Bipartite):
+        return 1
+    n_pairs = math.prod(problem.graph.edge_shape)
+    n_pairs += 0 if isinstance(problem, Qubo) else sum(len(block.variables) for block in problem.longer)
+    return max(2, round(6 * problem.n / max(n_pairs, 1)))
+
+
+@cache
+def _import_failure() -> str | None:
+    """Why the compiled kernels cannot be loaded; None if they can."""
+    try:
+        from memcomp_lightning.solvers.dmm.kernels import cpu  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
+        return (
+            f"numba: {error}. The plain torch kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
+        )
+    return None
+
+
+@cache
+def _say_once(message: str) -> None:
+    log.info(message)
+
+
+def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> Qubo | WeightedMaxSat:
+    """Apply a change of the axes of problems to all tensors that have them."""
+    if isinstance(problem, Qubo):
+        return dataclasses.replace(
+            problem,
+            coupling=change(problem.coupling),
+            linear=change(problem.linear),
+            offset=change(problem.offset),
+        )
+    return dataclasses.replace(
+        problem,
+        weight=change(problem.weight),
+        first=change(problem.first.expand(problem.weight.shape)),
+        second=change(problem.second.expand(problem.weight.shape)),
+        unit=change(problem.unit),
+        offset=change(problem.offset),
+        longer=tuple(dataclasses.replace(block, weight=change(block.weight)) for block in problem.longer),
+    )
+
+
+def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
+    """Two layers of which few variables are coupled, as a list of the couplings that are there."""
+    if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
+        return problem
+    if problem.coupling.count_nonzero() > _SPARSE * problem.coupling.numel():
+        return problem
+    used = (problem.coupling != 0).reshape(-1, *problem.graph.edge_shape).any(0).flatten()
+    if used.sum() > _SPARSE * used.numel():
+        return problem
+    flat = problem.coupling.reshape(*problem.problems, -1)
+    pairs = problem.graph.edges().to(used.device)[used]
+    return dataclasses.replace(problem, graph=EdgeList(n=problem.n, pairs=pairs), coupling=flat[..., used])
+
+
+_SPARSE = 0.25
+"""Share of couplings below which a list is faster than a matrix."""
+
+
+def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
+    """All problems on one leading axis."""
+    n_problems, axes = math.prod(problem.problems), len(problem.problems)
+    if axes == 1:
+        return problem
+    return _map(problem, lambda x: x.reshape(n_problems, *x.shape[axes:]))
+
+
+def _select(problem: Qubo | WeightedMaxSat, chosen: Tensor) -> Qubo | WeightedMaxSat:
+    """Some of the problems on the leading axis."""
+    return _map(problem, lambda x: x[chosen])
+
+
+def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -> Trajectory:
+    """Add what the records weigh, from their states in float64, and how long each one stands."""
+    n_problems, n_restarts = times.shape[:2]
+    n_terms = math.prod(problem.graph.edge_shape) + problem.n
+    if isinstance(problem, WeightedMaxSat):
+        n_terms += sum(block.variables.numel() for block in problem.longer)
+    # All records at once could need memory for records x terms.
+    block = max(1, _MOST_TERMS // (n_problems * n_restarts * n_terms))
+    parts = (problem.energy(part.flatten(1, 2)) for part in states.split(block, dim=2))
+    energies = torch.cat([part.unflatten(-1, (n_restarts, -1)) for part in parts], dim=-1)
+    offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
+    dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
+    return Trajectory(times, energies - offset[:, None, None], states, dwell)
+
+
+_MOST_TERMS = 2**22
+"""Terms of energies that are held at once: 32 MiB in float64."""
+
+
+def _join(parts: list[tuple[Tensor, slice, Tensor]], shape: tuple[int, int], elsewhere: float) -> Tensor:
+    """What all groups returned, ``(n_problems, n_restarts, ...)``; ``elsewhere`` where no restart was run."""
+    first = parts[0][2]
+    if first.shape[:2] == shape:
+        return first
+    joined = first.new_full((*shape, *first.shape[2:]), elsewhere)
+    for problems, restarts, values in parts:
+        joined[problems, restarts] = values
+    return joined
