@@ -1,26 +1,8 @@
-"""Bridges to other projects; each needs its own package, and says which where it is missing."""
-
-from typing import Any
+"""Our solvers in dimod, and D-Wave's annealers: each needs its own package, and says which where it is missing."""
 
 from memcomp_lightning.interop.annealer_graph import annealer_graph
+from memcomp_lightning.optional import on_demand
 
-_OF_DIMOD = ("AnnealerSamples", "DimodSolver", "from_bqm", "maximum_pseudo_likelihood_beta", "to_bqm")
+__all__ = ["DmmDimodSampler", "QpuSampler", "annealer_graph"]
 
-__all__ = [*_OF_DIMOD, "DmmDimodSampler", "QpuSampler", "annealer_graph"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import what needs dimod when it is asked for."""
-    if name in (*_OF_DIMOD, "DmmDimodSampler"):
-        from memcomp_lightning.interop import dimod  # first: it says what to install
-
-        if name in _OF_DIMOD:
-            return getattr(dimod, name)
-        from memcomp_lightning.interop.dmm_sampler import DmmDimodSampler
-
-        return DmmDimodSampler
-    if name == "QpuSampler":
-        from memcomp_lightning.interop.qpu import QpuSampler
-
-        return QpuSampler
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = on_demand(__name__, {"DmmDimodSampler": "dmm_sampler", "QpuSampler": "qpu"})

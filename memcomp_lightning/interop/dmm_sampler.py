@@ -3,14 +3,20 @@
 import dataclasses
 from typing import Any
 
-import dimod
 import numpy as np
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.interop.dimod import from_bqm
+from memcomp_lightning.optional import WITHOUT_DIMOD
 from memcomp_lightning.solvers import QuboSolver, Status
 from memcomp_lightning.solvers.dmm import DmmSolver
+
+try:
+    import dimod
+
+    from memcomp_lightning.problems.bqm import from_bqm
+except ModuleNotFoundError:
+    raise ModuleNotFoundError(WITHOUT_DIMOD) from None
 
 
 class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]

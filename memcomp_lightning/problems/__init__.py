@@ -1,5 +1,6 @@
 """QUBO and weighted MAX-SAT: problems, their files, and the exact mappings between them."""
 
+from memcomp_lightning.optional import on_demand
 from memcomp_lightning.problems.files.formats import FORMATS
 from memcomp_lightning.problems.files.numbers import in_full
 from memcomp_lightning.problems.files.objective import Score
@@ -27,3 +28,5 @@ __all__ = [
     "read_problem",
     "to_qubo",
 ]
+
+__getattr__ = on_demand(__name__, {"from_bqm": "bqm", "to_bqm": "bqm"})

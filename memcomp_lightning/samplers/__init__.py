@@ -1,5 +1,6 @@
 """Samplers of the negative phase: one file each, one protocol."""
 
+from memcomp_lightning.optional import on_demand
 from memcomp_lightning.samplers.base import NegativePhaseSampler, tensors_of, with_tensors
 from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.clamped import (
@@ -36,3 +37,5 @@ __all__ = [
     "tensors_of",
     "with_tensors",
 ]
+
+__getattr__ = on_demand(__name__, dict.fromkeys(("AnnealerSamples", "maximum_pseudo_likelihood_beta"), "annealer"))

@@ -1,5 +1,6 @@
 """Solvers of QUBOs behind one contract: exact ones, heuristics, and in ``dmm`` the memcomputing machine."""
 
+from memcomp_lightning.optional import on_demand
 from memcomp_lightning.solvers.alternating_descent import AlternatingDescent
 from memcomp_lightning.solvers.annealing import GibbsAnnealing
 from memcomp_lightning.solvers.answer import Answer, write_solution
@@ -19,3 +20,5 @@ __all__ = [
     "Trajectory",
     "write_solution",
 ]
+
+__getattr__ = on_demand(__name__, {"DimodSolver": "dimod"})

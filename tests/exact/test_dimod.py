@@ -1,5 +1,6 @@
 """dimod both ways: models, solvers, negative phases, and the DMM under dimod's own tests."""
 
+import importlib
 import sys
 import time
 import unittest
@@ -13,22 +14,16 @@ pytest.importorskip("dwave.samplers")
 
 from dwave.samplers import SimulatedAnnealingSampler, TabuSampler  # noqa: E402
 
+import memcomp_lightning  # noqa: E402
 from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
-from memcomp_lightning.interop import (  # noqa: E402
-    AnnealerSamples,
-    DimodSolver,
-    DmmDimodSampler,
-    from_bqm,
-    maximum_pseudo_likelihood_beta,
-    to_bqm,
-)
+from memcomp_lightning.interop import DmmDimodSampler  # noqa: E402
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
 from memcomp_lightning.models.enumeration import binary_states  # noqa: E402
-from memcomp_lightning.problems import Qubo, from_model  # noqa: E402
-from memcomp_lightning.samplers import positive_phase  # noqa: E402
+from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noqa: E402
+from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
 from memcomp_lightning.samplers.gibbs import chains_of  # noqa: E402
-from memcomp_lightning.solvers import BruteForce, Status  # noqa: E402
+from memcomp_lightning.solvers import BruteForce, DimodSolver, Status  # noqa: E402
 from memcomp_lightning.solvers.dmm import DmmSolver  # noqa: E402
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
 
@@ -206,13 +201,15 @@ def test_wrong_settings_are_refused(settings, message):
 
 
 def test_without_dimod_the_error_says_what_to_install(monkeypatch):
-    import memcomp_lightning.interop as interop
-
     monkeypatch.setitem(sys.modules, "dimod", None)
-    monkeypatch.delitem(sys.modules, "memcomp_lightning.interop.dimod")
-    monkeypatch.delattr(interop, "dimod")
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'memcomp-lightning\[dimod\]'"):
-        _ = interop.DimodSolver
+    for module in ("problems.bqm", "solvers.dimod", "samplers.annealer"):
+        monkeypatch.delitem(sys.modules, f"memcomp_lightning.{module}")
+    for name in ("problems.to_bqm", "solvers.DimodSolver", "samplers.AnnealerSamples"):
+        package, _, name = f"memcomp_lightning.{name}".rpartition(".")
+        with pytest.raises(ModuleNotFoundError, match=r"pip install 'memcomp-lightning\[dimod\]'"):
+            getattr(importlib.import_module(package), name)
+    with pytest.raises(AttributeError, match="no attribute 'Dimod'"):
+        _ = memcomp_lightning.solvers.Dimod
 
 
 # --- the DMM as a sampler of dimod ------------------------------------------------------------------------

@@ -15,11 +15,11 @@ from dwave.system.testing import MockDWaveSampler  # noqa: E402
 
 from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
-from memcomp_lightning.interop import AnnealerSamples, DimodSolver, QpuSampler, to_bqm  # noqa: E402
+from memcomp_lightning.interop import QpuSampler  # noqa: E402
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
-from memcomp_lightning.problems import Qubo, from_model  # noqa: E402
-from memcomp_lightning.samplers import positive_phase  # noqa: E402
-from memcomp_lightning.solvers import BruteForce  # noqa: E402
+from memcomp_lightning.problems import Qubo, from_model, to_bqm  # noqa: E402
+from memcomp_lightning.samplers import AnnealerSamples, positive_phase  # noqa: E402
+from memcomp_lightning.solvers import BruteForce, DimodSolver  # noqa: E402
 from memcomp_lightning.testing import check_sampler, small_dbm, small_machine, small_rbm  # noqa: E402
 
 GRAPHS = {"chimera": [4, 4, 4], "pegasus": [3], "zephyr": [2, 4]}

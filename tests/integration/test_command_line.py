@@ -259,8 +259,8 @@ def test_pretrained_weights_start_another_run(memcomp_train: Run) -> None:
 
 def test_a_missing_package_names_the_extra_to_install(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "dimod", None)
-    monkeypatch.delitem(sys.modules, "memcomp_lightning.interop.dimod", raising=False)
-    monkeypatch.delattr("memcomp_lightning.interop.dimod", raising=False)
+    for module in ("problems.bqm", "solvers.dimod", "samplers.annealer"):
+        monkeypatch.delitem(sys.modules, f"memcomp_lightning.{module}", raising=False)
     outcome = memcomp_train("sampler=annealer")
     assert outcome.status == 2
     assert "pip install 'memcomp-lightning[dimod]'" in outcome.err

@@ -200,19 +200,21 @@ def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_pat
 def test_imports_without_extras(python: Path, tmp_path: Path) -> None:
     code = """
 import importlib, pkgutil, memcomp_lightning
-needs = {"memcomp_lightning.interop." + name for name in ("dimod", "dmm_sampler", "qpu")}
+needs = ("problems.bqm", "solvers.dimod", "samplers.annealer", "interop.dmm_sampler", "interop.qpu")
 for module in pkgutil.walk_packages(memcomp_lightning.__path__, "memcomp_lightning."):
-    if module.name not in needs:
+    if not module.name.endswith(needs):
         importlib.import_module(module.name)
-for name in ("DimodSolver", "DmmDimodSampler", "QpuSampler"):
+named = {"solvers": ["DimodSolver"], "samplers": ["AnnealerSamples"], "interop": ["DmmDimodSampler", "QpuSampler"]}
+for package, name in [(package, name) for package, names in named.items() for name in names]:
     try:
-        getattr(memcomp_lightning.interop, name)
+        getattr(getattr(memcomp_lightning, package), name)
     except ModuleNotFoundError as error:
         print(name, error)
 """
     out = run_warm(python, "-c", code, folder=tmp_path)
     extras = re.findall(r"^(\w+) .*pip install 'memcomp-lightning\[(\w+)\]'\.$", out, flags=re.MULTILINE)
-    assert extras == [("DimodSolver", "dimod"), ("DmmDimodSampler", "dimod"), ("QpuSampler", "dwave")]
+    names = ("DimodSolver", "AnnealerSamples", "DmmDimodSampler", "QpuSampler")
+    assert extras == list(zip(names, ("dimod", "dimod", "dimod", "dwave"), strict=True))
 
 
 def test_parallel_search_with_hydra_1_4(python: Path, plugins: Path, tmp_path: Path) -> None:

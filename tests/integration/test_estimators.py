@@ -24,12 +24,12 @@ from memcomp_lightning import defaults
 from memcomp_lightning.data import SparseRows
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.estimators import MemcompDBNClassifier, MemcompRBM, inputs
-from memcomp_lightning.interop import AnnealerSamples
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining
 from memcomp_lightning.samplers import (
     CD,
     PCD,
+    AnnealerSamples,
     Exact,
     GroundState,
     ModeAssisted,

@@ -1,0 +1,95 @@
+"""Samplers of dimod as solvers: of dwave-samplers, a quantum annealer behind its composites, hybrid ones."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import SettingError, require, require_count
+from memcomp_lightning.problems.bqm import to_bqm
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.base import QuboSolution, Status
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DimodSolver:
+    """Any ``dimod.Sampler`` as a :class:`QuboSolver`: of dwave-samplers, a QPU behind its composites, LeapHybrid.
+
+    Problems are solved one after the other. A sampler with a ``seed`` parameter gets one from the random stream.
+
+    Attributes:
+        sampler: The sampler; reads are restarts.
+        parameters: Keyword arguments of its ``sample``: ``{"num_reads": 28, "num_sweeps": 100}``.
+    """
+
+    sampler: Any
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_parameters(self.sampler, self.parameters)
+
+    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+        """Return every read of every problem; where one has fewer reads, the rest is marked as not run."""
+        begin = time.perf_counter()
+        flat = [problem_at(qubo, index) for index in range(max(1, qubo.offset.numel()))]
+        reads = [reads_of(sample_set(self.sampler, one, self.parameters, generator), one) for one in flat]
+        n_reads = max(len(x) for x in reads)
+        x = torch.stack([torch.cat((x, x[:1].expand(n_reads - len(x), -1))) for x in reads])
+        x = x.view(*qubo.problems, n_reads, qubo.n)
+        counts = torch.tensor([len(x) for x in reads], device=x.device).view(*qubo.problems, 1)
+        was_run = torch.arange(n_reads, device=x.device) < counts
+        status = torch.where(was_run, int(Status.STEP_BUDGET), int(Status.NOT_RUN))
+        energies = qubo.energy(x).masked_fill(~was_run, torch.inf)
+        return QuboSolution(x, energies, status, was_run.long(), time.perf_counter() - begin)
+
+
+def sample_set(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: Generator) -> Any:
+    """The sample set of one problem.
+
+    Raises:
+        SettingError: The sampler does not take the parameters.
+    """
+    given = dict(parameters)
+    if "seed" in sampler.parameters and "seed" not in given:
+        given["seed"] = int(torch.randint(2**31, (), generator=generator, device=generator.device))
+    try:
+        return sampler.sample(to_bqm(qubo), **given)
+    except (TypeError, ValueError) as error:
+        kind = type(sampler).__name__
+        raise SettingError(f"parameters = {dict(parameters)} does not suit {kind}.sample: {error}") from error
+
+
+def reads_of(answer: Any, qubo: Qubo) -> Tensor:
+    """Assignments of one problem, a row a read, ``(n_reads, n)``."""
+    record, order = answer.record, torch.as_tensor([int(variable) for variable in answer.variables])
+    rows = torch.as_tensor(record.sample.astype("float32")).repeat_interleave(
+        torch.as_tensor(record.num_occurrences.astype("int64")), dim=0
+    )
+    x = torch.empty_like(rows)
+    x[:, order] = (rows > 0).to(rows.dtype)
+    return x.to(qubo.linear)
+
+
+def problem_at(qubo: Qubo, index: int) -> Qubo:
+    """One of the problems."""
+    n = max(1, qubo.offset.numel())
+    coupling = qubo.coupling.reshape(n, *qubo.graph.edge_shape)[index]
+    return Qubo(qubo.graph, coupling, qubo.linear.reshape(n, qubo.n)[index], qubo.offset.reshape(n)[index])
+
+
+def check_parameters(sampler: Any, parameters: Mapping[str, Any]) -> None:
+    """Refuse what is no sampler of dimod, and parameters that it does not take."""
+    require(
+        hasattr(sampler, "sample") and hasattr(sampler, "parameters"),
+        "sampler",
+        type(sampler).__name__,
+        "a dimod.Sampler",
+    )
+    for name in parameters:
+        known = sorted(sampler.parameters)
+        require(name in known, f"parameter of {type(sampler).__name__}", name, f"one of {', '.join(known)}")
+    if "num_reads" in parameters:
+        require_count("num_reads", parameters["num_reads"])
