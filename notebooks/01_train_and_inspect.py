@@ -34,7 +34,6 @@ from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
 from memcomp_lightning.plotting import picture_grid
 from memcomp_lightning.samplers import CD
-from memcomp_lightning.samplers.gibbs import chains_of
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # fewer greetings
 images = Digits().load()
@@ -96,7 +95,7 @@ plt.show()
 # %%
 rbm = dbn[0]
 fields = rbm.weight.detach()
-chains = chains_of(rbm)
+chains = rbm.chains()
 generator = rng.stream(0, "fantasies")
 v = chains.random(24, generator=generator)
 for _ in range(200):

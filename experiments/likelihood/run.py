@@ -27,10 +27,10 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
 )
 from memcomp_lightning.models import DBN, RBM, Gaussian, Initialiser, Xavier
+from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.replicas import Rates, pretrain_layer
 from memcomp_lightning.samplers import PCD
-from memcomp_lightning.samplers.gibbs import sweep
 
 CASES = {"centred": Centring(rate=0.01), "plain": None}
 

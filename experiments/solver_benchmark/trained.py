@@ -14,8 +14,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Batches, Digits, Mnist, ReducedMnist
 from memcomp_lightning.models import RBM
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import CD, PCD, GroundState
-from memcomp_lightning.samplers.gibbs import positive_phase
+from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
 from memcomp_lightning.solvers.dmm import DmmSolver
 
 SAMPLERS = {

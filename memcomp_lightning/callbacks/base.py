@@ -28,7 +28,6 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.enumeration import n_enumerated
 from memcomp_lightning.plotting.rendering import rendered
 
 
@@ -98,13 +97,13 @@ def write_figure(trainer: pl.Trainer, module: pl.LightningModule, tag: str, figu
 
 
 def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_units: int) -> None:
-    """Refuse models that are too large to enumerate (:func:`n_enumerated`): all of the module's, before training.
+    """Refuse models that are too large to enumerate (``n_enumerated``): all of the module's, before training.
 
     Raises:
         SettingError: Naming callback and size.
     """
     for rbm in getattr(module, "models", None) or [rbm_of(module)]:
-        n_units = n_enumerated(rbm)
+        n_units = rbm.n_enumerated
         name = type(callback).__name__
         require(
             n_units <= max_units,

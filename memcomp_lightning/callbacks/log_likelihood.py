@@ -20,7 +20,6 @@ from memcomp_lightning.callbacks.base import (
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
-from memcomp_lightning.models.enumeration import n_enumerated
 
 QUICKLY_ENUMERATED = 16
 """Units that "auto" enumerates at most."""
@@ -190,7 +189,7 @@ class LogLikelihood(EveryIterations):
         """How log Z of a model is found; None if it is not."""
         if self.method != "auto":
             return self.method
-        if n_enumerated(model) <= min(QUICKLY_ENUMERATED, self.max_units):
+        if model.n_enumerated <= min(QUICKLY_ENUMERATED, self.max_units):
             return "exact"
         two_layers = len(getattr(model, "classes", "vh")) == 2
         n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)

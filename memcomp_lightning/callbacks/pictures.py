@@ -11,7 +11,6 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, required, tensorboards
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
-from memcomp_lightning.samplers.gibbs import chains_of
 
 
 class Layout(Protocol):
@@ -105,7 +104,7 @@ class ModelSamples(Pictures):
         """Run the chains and project them down to the inputs."""
         rbm = rbm_of(pl_module)
         generator = rng.stream(self.seed, "evaluation")
-        chains = chains_of(rbm)
+        chains = rbm.chains()
         x = chains.random(self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
             x = chains.sweep(x, generator=generator)

@@ -20,12 +20,11 @@ from memcomp_lightning.likelihood import (
     log_likelihood_or_bound,
     log_partition_function,
 )
-from memcomp_lightning.models import RBM, BoltzmannMachine, folded
-from memcomp_lightning.models.enumeration import n_enumerated
+from memcomp_lightning.models import RBM, EnergyModel, as_two_layers
+from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.modules.stage import LARGEST_WEIGHT
 from memcomp_lightning.replicas import Pass
-from memcomp_lightning.samplers import Exact, ModeAssisted, gibbs, positive_phase
-from memcomp_lightning.samplers.gibbs import has_classes
+from memcomp_lightning.samplers import Exact, ModeAssisted, positive_phase
 from memcomp_lightning.types import Configurations
 
 FANTASY_SWEEPS = 200
@@ -83,7 +82,7 @@ def _ais(data: Any, n_reported: int) -> Measure:
         start, generator = v[: ais.n_chains].expand(*rbm.replicas, -1, -1), rng.stream(0, "fantasies")
         two_layers, base_of_two, samples = _of_two_layers(rbm, base, start, generator)
         for _ in range(FANTASY_SWEEPS):
-            samples = gibbs.sweep(two_layers, samples, generator=generator)
+            samples = sweep(two_layers, samples, generator=generator)
         down = ReverseAis().estimate(two_layers, samples, generator=rng.stream(0, "reverse ais"), base=base_of_two)
         return Scores(negative(rbm, up.log_z), negative(rbm, down.log_z))
 
@@ -98,12 +97,15 @@ MEASURES: Mapping[str, Callable[[Any, int], Measure]] = {
 """Exact divergence; exact log-likelihood (smaller layer up to 25 units); log-likelihood by AIS both ways."""
 
 
-def _of_two_layers(model: Any, base: Tensor, v: Tensor, generator: Generator) -> tuple[RBM, Tensor, Tensor]:
+def _of_two_layers(
+    model: EnergyModel, base: Tensor, v: Tensor, generator: Generator
+) -> tuple[RBM, Tensor, Tensor]:
     """An RBM, its base and where its chains start; a DBM is the RBM between its odd and its even layers."""
-    if not isinstance(model, BoltzmannMachine):
-        return model, base, v
+    layers = as_two_layers(model)
+    if layers.units is None:
+        return layers.rbm, base, v
     x = torch.cat((v, rng.bernoulli(model.hidden_mean(v), generator=generator)), dim=-1)
-    return folded(model), base_on_first_class(model, base), x[..., model.classes[0]]
+    return layers.rbm, base_on_first_class(model, base), layers.first(x)
 
 
 def _negative_log_likelihood(data: Any, n_reported: int) -> Callable[[RBM, Tensor], Tensor]:
@@ -143,10 +145,12 @@ def gradient_bias(rbm: RBM, sampler: Any, done: Pass, n_draws: int) -> tuple[Ten
     """
     exact, generator = Exact(max_units=MAX_UNITS), rng.stream(done.number, "gradient bias")
     sizes = (done.positive.v.shape[-1], done.positive.h.shape[-1])
-    if n_enumerated(rbm) > exact.max_units or sizes != (rbm.n_visible, rbm.n_hidden):
+    if rbm.n_enumerated > exact.max_units or sizes != (rbm.n_visible, rbm.n_hidden):
         nothing = torch.full(rbm.replicas, math.nan)
         return nothing, nothing
-    positive = done.positive if has_classes(rbm) else positive_phase(rbm, done.positive.v)
+    # Where hidden units are coupled to each other, the sampler of the positive phase has chosen them.
+    independent = rbm.quadratic_form().pairs is None
+    positive = positive_phase(rbm, done.positive.v) if independent else done.positive
     true = mean_gradient(rbm, exact, exact.init(rbm, 1, generator=generator), positive, 1, generator=generator)
     mean = mean_gradient(rbm, sampler, done.state, positive, n_draws, generator=generator)
     return compared(mean, true)

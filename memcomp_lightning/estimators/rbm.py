@@ -40,9 +40,10 @@ from memcomp_lightning.likelihood import (
     log_pseudo_likelihood,
 )
 from memcomp_lightning.models import RBM
+from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.replicas import ContrastTraining, Rates, require_finite
-from memcomp_lightning.samplers import PCD, gibbs, positive_phase
+from memcomp_lightning.samplers import PCD, positive_phase
 
 MOST_ENUMERATED = 20
 """Units of the smaller layer up to which a log-likelihood is exact."""
@@ -277,7 +278,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         X = self._checked(v)
         with on_the_cpu(), torch.no_grad():
             data, rbm = in_precision_of(X, self.rbm_)
-            parts = [gibbs.sweep(rbm, part, generator=self._gibbs_generator) for part in dense_parts(data)]
+            parts = [sweep(rbm, part, generator=self._gibbs_generator) for part in dense_parts(data)]
             return self._scaling.to_data(array_of(torch.cat(parts), like=X))
 
     def sample(self, n_samples: int = 1, *, n_steps: int = 1000, random_state: Any = None) -> NDArray[Any]:
@@ -306,7 +307,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             else:
                 v = rng.bernoulli(torch.sigmoid(self._base).expand(n_samples, -1), generator=generator)
                 for _ in range(n_steps):
-                    v = gibbs.sweep(self.rbm_, v, generator=generator)
+                    v = sweep(self.rbm_, v, generator=generator)
             return self._scaling.to_data(v.numpy())
 
     def score_samples(self, X: Any) -> NDArray[np.float64]:

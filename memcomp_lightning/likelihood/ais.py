@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
-from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
+from memcomp_lightning.models.base import EnergyModel, as_two_layers
 from memcomp_lightning.models.init import mean_log_odds
 from memcomp_lightning.models.rbm import RBM
 
@@ -84,7 +84,7 @@ class Ais:
 
     def estimate(
         self,
-        model: RBM | BoltzmannMachine,
+        model: EnergyModel,
         *,
         generator: Generator,
         base: Tensor | None = None,
@@ -228,13 +228,11 @@ def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
     return model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
 
 
-def _two_layers(model: RBM | BoltzmannMachine, base: Tensor) -> tuple[RBM, Tensor]:
-    if isinstance(model, BoltzmannMachine):
-        return folded(model), base_on_first_class(model, base)
-    return model, base
+def _two_layers(model: EnergyModel, base: Tensor) -> tuple[RBM, Tensor]:
+    return as_two_layers(model).rbm, base_on_first_class(model, base)
 
 
-def _base(model: RBM | BoltzmannMachine, base: Tensor | None) -> Tensor:
+def _base(model: EnergyModel, base: Tensor | None) -> Tensor:
     """The base's bias for each replica."""
     shape = model.b.shape
     if base is None:

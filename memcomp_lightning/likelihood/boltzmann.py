@@ -9,24 +9,24 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.layers import softplus
-from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine
+from memcomp_lightning.models.base import Block, EnergyModel
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.models.mean_field import hidden_blocks, mean_field
+from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
 
 _NUMBERS = 2**23
 """float64 numbers held at a time."""
 
 
-def base_on_first_class(model: BoltzmannMachine, base: Tensor) -> Tensor:
+def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
     """A base of visible units as one of the units of the first class, zero for the hidden ones among them."""
-    units = model.classes[0]
+    units = model.blocks()[0].units
     wide = base.new_zeros(*base.shape[:-1], model.n_units)
     wide[..., : model.n_visible] = base
     return wide[..., units]
 
 
 @torch.no_grad()
-def log_partition_function_by_classes(model: BoltzmannMachine, max_units: int) -> Float[Tensor, "*replicas"]:
+def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Float[Tensor, "*replicas"]:
     """Log Z by enumerating all units outside the largest class."""
     model = _double(model)
     blocks = model.blocks()
@@ -46,7 +46,7 @@ def log_partition_function_by_classes(model: BoltzmannMachine, max_units: int) -
 
 
 @torch.no_grad()
-def log_hidden_sum(model: BoltzmannMachine, v: Tensor, max_units: int) -> Float[Tensor, "*replicas n"]:
+def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> Float[Tensor, "*replicas n"]:
     """Log of the sum over h of exp(-E(v, h)), by enumerating all hidden units outside their largest class."""
     model = _double(model)
     v = v.double().expand(*model.replicas, *v.shape[-2:])
@@ -70,7 +70,7 @@ def log_hidden_sum(model: BoltzmannMachine, v: Tensor, max_units: int) -> Float[
 
 @torch.no_grad()
 def log_likelihood_bound(
-    model: BoltzmannMachine,
+    model: EnergyModel,
     v: Float[Tensor, "*axes n n_visible"],
     log_z: Float[Tensor, "*replicas"],
     *,
@@ -98,17 +98,17 @@ def log_likelihood_bound(
     found = []
     for some in v.split(10_000, dim=-2):
         h = mean_field(model, some, max_iterations=max_iterations, tolerance=tolerance).h
-        found.append(-model.free_energy_of_means(some, h))
+        found.append(-free_energy_of_means(model, some, h))
     return torch.cat(found, dim=-1) - log_z.double().unsqueeze(-1)
 
 
-def _summed_over(model: BoltzmannMachine, block: Block, x: Tensor) -> Tensor:
+def _summed_over(model: EnergyModel, block: Block, x: Tensor) -> Tensor:
     """Log of the sum of exp(-E) over the units of a block, which are 0 in x."""
     energy = model.energy(x[..., : model.n_visible], x[..., model.n_visible :])
     return softplus(block.field(x)).sum(-1) - energy
 
 
-def _double(model: BoltzmannMachine) -> BoltzmannMachine:
+def _double(model: EnergyModel) -> EnergyModel:
     return model if model.b.dtype == torch.float64 else copy.deepcopy(model).double()
 
 

@@ -15,7 +15,7 @@ from memcomp_lightning.likelihood.boltzmann import (
 )
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
 
@@ -28,7 +28,7 @@ _NUMBERS = 2**23
 
 @torch.no_grad()
 def log_partition_function(
-    model: RBM | BoltzmannMachine, *, max_units: int = 25, progress: bool = False
+    model: EnergyModel, *, max_units: int = 25, progress: bool = False
 ) -> Float[Tensor, "*replicas"]:
     r"""Return log Z, by enumerating the smaller layer.
 
@@ -52,11 +52,10 @@ def log_partition_function(
     >>> log_partition_function(RBM(n_visible=3, n_hidden=2)).shape
     torch.Size([])
     """
-    if isinstance(model, BoltzmannMachine):
-        if len(model.classes) != 2:
-            return log_partition_function_by_classes(model, max_units)
-        model = folded(model)
-    layers = enumerable(model, max_units)
+    two_layers = model.two_layers()
+    if two_layers is None:
+        return log_partition_function_by_classes(model, max_units)
+    layers = enumerable(two_layers.rbm, max_units)
     return prefix_log_weights(layers, progress=progress).logsumexp(-1).reshape(model.replicas)
 
 
@@ -106,7 +105,7 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
 
 @torch.no_grad()
 def log_likelihood(
-    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
+    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
 ) -> Float[Tensor, "*replicas n"]:
     """Return log p(v) = -F(v) - log Z of each image.
 
@@ -125,9 +124,10 @@ def log_likelihood(
         SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
-    if isinstance(model, BoltzmannMachine):
+    rbm = _as_rbm(model)
+    if rbm is None:
         return log_hidden_sum(model, v, max_units=MOST_HIDDEN) - log_z.double().unsqueeze(-1)
-    weight, b, c = _double(model)
+    weight, b, c = _double(rbm)
 
     def minus_free_energy(rows: Tensor) -> Tensor:
         field = rows @ weight.mT + c.unsqueeze(-2)
@@ -137,17 +137,17 @@ def log_likelihood(
 
 
 def log_likelihood_or_bound(
-    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
+    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
 ) -> Float[Tensor, "*replicas n"]:
     """:func:`log_likelihood`, or :func:`log_likelihood_bound` of a machine with more than 16 hidden units."""
-    if isinstance(model, BoltzmannMachine) and model.n_hidden > MOST_HIDDEN:
+    if model.n_hidden > MOST_HIDDEN and _as_rbm(model) is None:
         return log_likelihood_bound(model, v, log_z)
     return log_likelihood(model, v, log_z)
 
 
 @torch.no_grad()
 def kl_divergence(
-    model: RBM | BoltzmannMachine,
+    model: EnergyModel,
     v: Float[Tensor, "*axes n n_visible"],
     log_z: Float[Tensor, "*replicas"] | None = None,
 ) -> Float[Tensor, "*replicas"]:
@@ -184,7 +184,7 @@ def _log_shares(rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def log_pseudo_likelihood(
-    model: RBM | BoltzmannMachine, v: Float[Tensor, "*axes n n_visible"]
+    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"]
 ) -> Float[Tensor, "*replicas n n_visible"]:
     r"""Return log p(v_j | all other v) of each unit j of each image; needs no log Z.
 
@@ -204,7 +204,8 @@ def log_pseudo_likelihood(
         SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
-    if isinstance(model, BoltzmannMachine):
+    rbm = _as_rbm(model)
+    if rbm is None:
         flips = torch.eye(model.n_visible, dtype=torch.float64, device=v.device)
 
         def of_images(rows: Tensor) -> Tensor:
@@ -214,7 +215,7 @@ def log_pseudo_likelihood(
             return -softplus(log_sums.unflatten(-1, flipped.shape[-3:-1]) - log_sum)
 
         return _in_chunks(of_images, v, model.n_visible * model.n_units)
-    weight, b, c = _double(model)
+    weight, b, c = _double(rbm)
 
     def of_rows(rows: Tensor) -> Tensor:
         field = rows @ weight.mT + c.unsqueeze(-2)
@@ -226,7 +227,7 @@ def log_pseudo_likelihood(
     return _in_chunks(of_rows, v, model.n_visible * model.n_hidden)
 
 
-def _binary(model: RBM | BoltzmannMachine, v: Tensor) -> Tensor:
+def _binary(model: EnergyModel, v: Tensor) -> Tensor:
     """Images with the model's replica axes."""
     replicas = model.replicas
     fits = v.ndim >= 2 and v.shape[-1] == model.n_visible and v.shape[:-2] in ((), replicas)
@@ -241,6 +242,12 @@ def _binary(model: RBM | BoltzmannMachine, v: Tensor) -> Tensor:
         "Grey values have no likelihood under a Bernoulli RBM: binarise the images, say v > 0.5.",
     )
     return v.expand(*replicas, *v.shape[-2:])
+
+
+def _as_rbm(model: EnergyModel) -> RBM | None:
+    """The model if its two classes are the visible and the hidden units: sums over h have a closed form then."""
+    layers = model.two_layers()
+    return layers.rbm if layers is not None and layers.units is None else None
 
 
 def _double(model: RBM) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,6 +1,7 @@
 """Energy models and networks, each a ``torch.nn.Module`` on the replica axis."""
 
-from memcomp_lightning.models.boltzmann import Block, BoltzmannMachine, folded
+from memcomp_lightning.models.base import Block, Chains, EnergyModel, QuadraticForm, TwoLayers, as_two_layers
+from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
@@ -17,16 +18,20 @@ __all__ = [
     "BatchNormReluNetwork",
     "Block",
     "BoltzmannMachine",
+    "Chains",
+    "EnergyModel",
     "Gaussian",
     "GaussianMoments",
     "Initialiser",
     "Linear",
     "MeanFieldSolution",
+    "QuadraticForm",
     "Randomiser",
     "Shuffled",
+    "TwoLayers",
     "Uniform",
     "Xavier",
-    "folded",
+    "as_two_layers",
     "hidden_blocks",
     "mean_field",
     "mean_log_odds",

@@ -7,37 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
+from torch.nn.functional import softplus
 
 from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
+from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
+from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.init import Gaussian, Initialiser
-from memcomp_lightning.models.mean_field import mean_field
+from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
-
-
-class Block(NamedTuple):
-    """Units without couplings among them, with all that they are coupled to, at the present parameters.
-
-    Attributes:
-        units: Their indices, ``(n_class,)``.
-        neighbours: Indices of the units coupled to any of them, ``(n_neighbours,)``.
-        weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
-        bias: ``(*replicas, n_class)``.
-    """
-
-    units: Tensor
-    neighbours: Tensor
-    weight: Tensor
-    bias: Tensor
-
-    def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
-        """Log odds of each unit given all others."""
-        return affine(x[..., self.neighbours], self.weight, self.bias)
 
 
 class _Layout(NamedTuple):
@@ -215,6 +198,41 @@ class BoltzmannMachine(nn.Module):
             )
         return found
 
+    def chains(self) -> ClassChains:
+        """Gibbs chains of all units, at the present parameters."""
+        return ClassChains(self)
+
+    @property
+    def n_enumerated(self) -> int:
+        """Units whose states are enumerated where something is exact: all outside the largest class."""
+        return self.n_units - max(len(units) for units in self.classes)
+
+    @torch.no_grad()
+    def all_configurations(self) -> Configurations:
+        """All states outside the largest class with their probabilities as weights, that class by its means."""
+        largest = max(self.blocks(), key=lambda block: len(block.units))
+        others = torch.ones(self.n_units, dtype=torch.bool, device=self.b.device)
+        others[largest.units] = False
+        states = binary_states(self.n_enumerated, like=self.b)
+        x = states.new_zeros(*self.replicas, len(states), self.n_units)
+        x[..., others] = states
+        # Summed over the largest class: exp(-E) with that class off, times 1 + exp(field) for each of its units.
+        field, n = largest.field(x), self.n_visible
+        log_weight = softplus(field.double()).sum(-1) - self.energy(x[..., :n], x[..., n:]).double()
+        x[..., largest.units] = torch.sigmoid(field)
+        return Configurations(x[..., :n], x[..., n:], torch.softmax(log_weight, dim=-1).to(x.dtype))
+
+    def quadratic_form(self) -> QuadraticForm:
+        """The couplings of all pairs, and the biases."""
+        return QuadraticForm(self.pairs, self.coupling, self.bias)
+
+    def two_layers(self) -> TwoLayers | None:
+        """The RBM between the two classes of units, where there are two.
+
+        Of a DBM it has the odd layers on one side and the even ones on the other (Salakhutdinov & Hinton 2009).
+        """
+        return TwoLayers(_folded(self), torch.cat(self.classes)) if len(self.classes) == 2 else None
+
     @property
     def weight(self) -> Float[Tensor, "*replicas n_hidden n_visible"]:
         """Couplings of hidden to visible units, zero where there are none, as a copy."""
@@ -299,35 +317,13 @@ class BoltzmannMachine(nn.Module):
 
         It is F(v) if no two hidden units are coupled, and above it otherwise.
         """
-        return self.free_energy_of_means(v, self.hidden_mean(v))
-
-    def free_energy_of_means(
-        self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
-    ) -> Float[Tensor, "*replicas n"]:
-        r"""``E(v, m) - \sum_i H(m_i)`` of given means m of the hidden units: an upper bound of F(v)."""
-        negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
-        return self.energy(v, h) + negative_entropy
+        return free_energy_of_means(self, v, self.hidden_mean(v))
 
 
 @torch.no_grad()
-def folded(model: BoltzmannMachine) -> RBM:
-    """The RBM between the two classes of a machine that has two, the units of the first as its visible ones.
-
-    It has the energies of the machine; of a DBM, it has the odd layers on one side and the even ones on the other
-    (Salakhutdinov & Hinton 2009).
-
-    Raises:
-        SettingError: The machine has more classes, or one.
-    """
-    blocks = model.blocks()
-    require(
-        len(blocks) == 2,
-        "number of classes of units",
-        len(blocks),
-        "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
-        "Other machines can be enumerated up to 32 units outside the largest class.",
-    )
-    first, second = blocks
+def _folded(model: BoltzmannMachine) -> RBM:
+    """The RBM between the two classes of a machine that has two, the units of the first as its visible ones."""
+    first, second = model.blocks()
     rbm = RBM(len(first.units), len(second.units), replicas=model.replicas)
     rbm.to(model.b)
     weight = torch.zeros_like(rbm.weight)

@@ -1,7 +1,5 @@
 """All states of a few binary units."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -26,13 +24,3 @@ def bits(numbers: Int[Tensor, "*axes"], n: int, *, like: Tensor) -> Float[Tensor
     """Return the n lowest bits of each number, the highest of them first, in the dtype of ``like``."""
     shifts = torch.arange(n - 1, -1, -1, device=like.device)
     return ((numbers.unsqueeze(-1) >> shifts) & 1).to(like.dtype)
-
-
-def n_enumerated(model: Any) -> int:
-    """Units whose states are enumerated where something is exact: the others follow from them in closed form.
-
-    Of two layers those of the smaller one, of any connectivity those outside the largest class.
-    """
-    if hasattr(model, "blocks"):
-        return int(model.n_visible + model.n_hidden - max(len(units) for units in model.classes))
-    return int(min(model.n_visible, model.n_hidden))

@@ -6,9 +6,10 @@ from typing import Protocol
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor, nn
+from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.models.base import EnergyModel
 
 
 class Initialiser(Protocol):
@@ -73,14 +74,8 @@ def mean_log_odds(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes
     return torch.log((n_on + 1) / (v.shape[-2] - n_on + 1))
 
 
-class HasVisibleBias(Protocol):
-    """An energy model, as far as :func:`start_at_means` needs it."""
-
-    b: nn.Parameter
-
-
 @torch.no_grad()
-def start_at_means(model: HasVisibleBias, v: Float[Tensor, "*axes n n_visible"]) -> None:
+def start_at_means(model: EnergyModel, v: Float[Tensor, "*axes n n_visible"]) -> None:
     """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
 
     Hinton 2012, A Practical Guide to Training RBMs, section 8.1.

@@ -1,28 +1,12 @@
 """Mean-field inference of units that are coupled to each other, with others clamped."""
 
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-
-class ClassedModel(Protocol):
-    """A model whose units fall into classes without couplings inside."""
-
-    @property
-    def n_visible(self) -> int:
-        """Number of visible units, which are numbered first."""
-        ...
-
-    @property
-    def n_hidden(self) -> int:
-        """Number of hidden units."""
-        ...
-
-    def blocks(self) -> Sequence[Any]:
-        """The classes with their couplings (:class:`memcomp_lightning.models.boltzmann.Block`)."""
-        ...
+from memcomp_lightning.models.base import Block, EnergyModel
 
 
 class MeanFieldSolution(NamedTuple):
@@ -43,7 +27,7 @@ class MeanFieldSolution(NamedTuple):
 
 @torch.no_grad()
 def mean_field(
-    model: ClassedModel,
+    model: EnergyModel,
     given: Tensor,
     *,
     clamped: Literal["visible", "hidden"] = "visible",
@@ -94,12 +78,20 @@ def mean_field(
     return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations)
 
 
-def hidden_blocks(model: ClassedModel) -> list[Any]:
+def free_energy_of_means(
+    model: EnergyModel, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
+) -> Float[Tensor, "*replicas n"]:
+    r"""``E(v, m) - \sum_i H(m_i)`` of given means m of the hidden units: an upper bound of F(v)."""
+    negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
+    return model.energy(v, h) + negative_entropy
+
+
+def hidden_blocks(model: EnergyModel) -> list[Block]:
     """The hidden units of each class, without the classes that have none."""
     return _part(model, "visible")
 
 
-def visible_blocks(model: ClassedModel) -> list[Any]:
+def visible_blocks(model: EnergyModel) -> list[Block]:
     """The visible units of each class, without the classes that have none."""
     return _part(model, "hidden")
 
@@ -109,7 +101,7 @@ def _among(units: Tensor, n_visible: int, clamped: str) -> Tensor:
     return units >= n_visible if clamped == "visible" else units < n_visible
 
 
-def _part(model: ClassedModel, clamped: str) -> list[Any]:
+def _part(model: EnergyModel, clamped: str) -> list[Block]:
     found = []
     for block in model.blocks():
         keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()

@@ -9,6 +9,9 @@ from torch.linalg import vecdot
 from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
+from memcomp_lightning.models.chains import TwoLayerChains
+from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream
@@ -69,6 +72,11 @@ class RBM(nn.Module):
     def n_hidden(self) -> int:
         """Number of hidden units."""
         return self.weight.shape[-2]
+
+    @property
+    def n_units(self) -> int:
+        """Number of all units."""
+        return self.n_visible + self.n_hidden
 
     @property
     def replicas(self) -> tuple[int, ...]:
@@ -155,6 +163,41 @@ class RBM(nn.Module):
     ) -> Float[Tensor, "*replicas n n_visible"]:
         """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.visible_field(h), beta))
+
+    def blocks(self) -> list[Block]:
+        """The visible and the hidden units."""
+        units = torch.arange(self.n_visible + self.n_hidden, device=self.b.device)
+        first, second = units[: self.n_visible], units[self.n_visible :]
+        return [Block(first, second, self.weight.mT, self.b), Block(second, first, self.weight, self.c)]
+
+    def chains(self) -> TwoLayerChains:
+        """Gibbs chains of the visible units, at the present parameters."""
+        return TwoLayerChains(self)
+
+    @property
+    def n_enumerated(self) -> int:
+        """Units whose states are enumerated where something is exact: those of the smaller layer."""
+        return min(self.n_visible, self.n_hidden)
+
+    @torch.no_grad()
+    def all_configurations(self) -> Configurations:
+        """All states of the smaller layer with their probabilities as weights, the other layer by its means."""
+        hidden_first = self.n_hidden < self.n_visible
+        states = binary_states(self.n_enumerated, like=self.b)
+        states = states.expand(*self.replicas, *states.shape)
+        free_energy = self.hidden_free_energy(states) if hidden_first else self.free_energy(states)
+        weight = torch.softmax(-free_energy.double(), dim=-1).to(states.dtype)
+        if hidden_first:
+            return Configurations(self.visible_mean(states), states, weight)
+        return Configurations(states, self.hidden_mean(states), weight)
+
+    def quadratic_form(self) -> QuadraticForm:
+        """The weights as couplings of all hidden to all visible units, and both biases."""
+        return QuadraticForm(None, self.weight, torch.cat((self.b, self.c), dim=-1))
+
+    def two_layers(self) -> TwoLayers:
+        """Itself."""
+        return TwoLayers(self, None)
 
     def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
         """The layer as part of a feed-forward network: p(h = 1 | v)."""

@@ -1,7 +1,7 @@
 """Samplers of the negative phase: one file each, one protocol."""
 
 from memcomp_lightning.optional import on_demand
-from memcomp_lightning.samplers.base import NegativePhaseSampler, tensors_of, with_tensors
+from memcomp_lightning.samplers.base import NegativePhaseSampler, positive_phase, tensors_of, with_tensors
 from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.clamped import (
     ClampedGibbs,
@@ -11,7 +11,6 @@ from memcomp_lightning.samplers.clamped import (
     PositivePhaseSampler,
 )
 from memcomp_lightning.samplers.exact import Exact
-from memcomp_lightning.samplers.gibbs import positive_phase
 from memcomp_lightning.samplers.ground_state import GroundState
 from memcomp_lightning.samplers.mode_assisted import ModeAssisted, ModeSchedule
 from memcomp_lightning.samplers.pcd import PCD

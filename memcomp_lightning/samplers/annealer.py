@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.models import RBM, BoltzmannMachine
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.solvers.dimod import check_parameters, problem_at, reads_of, sample_set
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -57,7 +57,7 @@ class AnnealerSamples:
         require(fits, "beta", self.beta, "a number > 0, or 'estimate'")
         require(0 < self.rate <= 1, "rate", self.rate, "a number in (0, 1]")
 
-    def init(self, model: RBM | BoltzmannMachine, n_chains: int, *, generator: Generator) -> AnnealerState:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> AnnealerState:
         """Begin with the given inverse temperature, or 1."""
         beta = 1.0 if self.beta == "estimate" else float(self.beta)
         return AnnealerState(torch.full(model.replicas, beta, dtype=model.b.dtype, device=model.b.device))
@@ -65,7 +65,7 @@ class AnnealerSamples:
     @torch.no_grad()
     def sample(
         self,
-        model: RBM | BoltzmannMachine,
+        model: EnergyModel,
         state: AnnealerState,
         positive: Configurations,
         *,

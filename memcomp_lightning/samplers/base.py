@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol, TypeVar
 
+import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_parts
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.types import Configurations, NegativePhase
 
 ModelT = TypeVar("ModelT", contravariant=True)
@@ -39,6 +41,12 @@ def with_tensors(state: StateT, tensors: Mapping[str, Tensor]) -> StateT:
             inner = {key.removeprefix(f"{name}."): t for key, t in tensors.items() if key.startswith(f"{name}.")}
             values[name] = with_tensors(value, inner)
     return type(state)(**values)
+
+
+@torch.no_grad()
+def positive_phase(model: EnergyModel, v: Tensor) -> Configurations:
+    """Return data with the hidden means given them, ``E[h | v]``."""
+    return Configurations(v, model.hidden_mean(v))
 
 
 def require_sampler(name: str, sampler: object) -> None:

@@ -1,17 +1,14 @@
 """Contrastive divergence."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Generator
 
-from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_choice, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of, has_classes
+from memcomp_lightning.models.base import EnergyModel, Readout
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
-
-Readout = Literal["mean", "sample"]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,7 +37,7 @@ class CD:
         require_choice("visible", self.visible, ("sample", "mean"))
         require_choice("hidden", self.hidden, ("mean", "sample"))
 
-    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> NoState:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> NoState:
         """Nothing to remember: every call starts at the data.
 
         Raises:
@@ -48,29 +45,14 @@ class CD:
         """
         for name, default in (("visible", "sample"), ("hidden", "mean")):
             readout, allowed = getattr(self, name), f"{default!r} for a model other than an RBM"
-            require(readout == default or not has_classes(model), name, readout, allowed)
+            require(readout == default or model.chains().free_readout, name, readout, allowed)
         return NoState()
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration an image, k sweeps away from it, with the image's weight."""
-        if has_classes(model):
-            chains = chains_of(model)
-            x = torch.cat((positive.v, rng.bernoulli(positive.h, generator=generator)), dim=-1)
-            for _ in range(self.k):
-                x = chains.sweep(x, generator=generator)
-            return NegativePhase(chains.read(x)._replace(weight=positive.weight), state, {})
-        # The first half sweep takes the hidden means that the positive phase has computed already.
-        h = rng.bernoulli(positive.h, generator=generator)
-        for _ in range(self.k - 1):
-            v = rng.bernoulli(model.visible_mean(h), generator=generator)
-            h = rng.bernoulli(model.hidden_mean(v), generator=generator)
-        v = model.visible_mean(h)
-        if self.visible == "sample":
-            v = rng.bernoulli(v, generator=generator)
-        h = model.hidden_mean(v)
-        if self.hidden == "sample":
-            h = rng.bernoulli(h, generator=generator)
-        return NegativePhase(Configurations(v, h, positive.weight), state, {})
+        readout = {"visible": self.visible, "hidden": self.hidden}
+        found = model.chains().from_data(positive, self.k, **readout, generator=generator)
+        return NegativePhase(found, state, {})

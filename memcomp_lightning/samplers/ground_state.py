@@ -7,8 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice, require_parts
-from memcomp_lightning.models.boltzmann import BoltzmannMachine, folded
-from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.problems.from_model import from_model
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
@@ -44,13 +43,13 @@ class GroundState:
                 "Use DmmSolver(record=Recording(every=8)), or readout = 'best'.",
             )
 
-    def init(self, model: RBM | BoltzmannMachine, n_chains: int, *, generator: Generator) -> NoState:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> NoState:
         """Nothing to remember: every update solves a new problem."""
         return NoState()
 
     @torch.no_grad()
     def sample(
-        self, model: RBM | BoltzmannMachine, state: NoState, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return x* or the weighted trajectory."""
         problem, order = problem_of(model)
@@ -65,17 +64,18 @@ class GroundState:
         return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
 
 
-def problem_of(model: RBM | BoltzmannMachine) -> tuple[Qubo, Tensor | None]:
+def problem_of(model: EnergyModel) -> tuple[Qubo, Tensor | None]:
     """The problem of a model, and where in its assignments the model's units are; None if in their places.
 
     A machine whose couplings fill most of the matrix between two classes, a DBM, is posed as an RBM: solvers are
     much faster on a matrix than on a list of pairs.
     """
-    if isinstance(model, BoltzmannMachine):
-        classes = model.classes
-        if len(classes) == 2 and len(model.pairs) > 0.5 * len(classes[0]) * len(classes[1]):
-            return from_model(folded(model)), torch.cat(classes).argsort()
-    return from_model(model), None
+    pairs, layers = model.quadratic_form().pairs, model.two_layers()
+    if pairs is None or layers is None or layers.units is None:
+        return from_model(model), None
+    if len(pairs) <= 0.5 * layers.rbm.n_visible * layers.rbm.n_hidden:
+        return from_model(model), None
+    return from_model(layers.rbm), layers.units.argsort()
 
 
 def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -1,27 +1,18 @@
 """Mode-assisted training: now and then the ground state takes the place of another sampler's negative phase."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.objective import shares
 from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
-from memcomp_lightning.samplers.tempering import TemperedModel
 from memcomp_lightning.types import Configurations, NegativePhase
-
-
-class SizedModel(TemperedModel, Protocol):
-    """A model with the energy of joint states and its parameters."""
-
-    def parameters(self) -> Iterator[Any]:
-        """Couplings and biases."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -97,7 +88,7 @@ class ModeAssisted:
         require_sampler("inner", self.inner)
         require_sampler("mode", self.mode)
 
-    def init(self, model: SizedModel, n_chains: int, *, generator: Generator) -> ModeAssistedState:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> ModeAssistedState:
         """Start both samplers."""
         return ModeAssistedState(
             torch.zeros((), dtype=torch.long, device="cpu"),
@@ -107,7 +98,7 @@ class ModeAssisted:
 
     @torch.no_grad()
     def sample(
-        self, model: SizedModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[ModeAssistedState]:
         """Toss the coin, and return one negative phase or the other, with its ``info``."""
         n_done = int(state.n_done)
@@ -120,7 +111,7 @@ class ModeAssisted:
 
     @torch.no_grad()
     def sample_mode(
-        self, model: SizedModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: ModeAssistedState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[ModeAssistedState]:
         """Return the negative phase of an update with the mode, whatever the schedule says; counts nothing."""
         found = self.mode.sample(model, state.mode, positive, generator=generator)
@@ -130,7 +121,7 @@ class ModeAssisted:
         return NegativePhase(mixed, state._replace(mode=found.state), info)
 
 
-def mode_scale(model: SizedModel, mode: Configurations) -> Tensor:
+def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
     """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1]; the lowest energy counts."""
     half_v, half_h = (torch.full_like(x[..., :1, :], 0.5) for x in (mode.v, mode.h))
     depth = model.energy(half_v, half_h).squeeze(-1) - model.energy(mode.v, mode.h).amin(-1)

@@ -7,12 +7,12 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.types import Configurations, NegativePhase
 
 
 class ChainStates(NamedTuple):
-    """States of the persistent chains, ``(*replicas, n_chains, n_units)``: see :class:`gibbs.Chains`."""
+    """States of the persistent chains, ``(*replicas, n_chains, n_units)``: see ``models.base.Chains``."""
 
     x: Tensor
 
@@ -45,17 +45,17 @@ class PCD:
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
 
-    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> ChainStates:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> ChainStates:
         """Start the chains at random states."""
         n = self.n_chains or n_chains * self.chains_per_datum
-        return ChainStates(chains_of(model).random(n, generator=generator))
+        return ChainStates(model.chains().random(n, generator=generator))
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: ChainStates, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: ChainStates, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[ChainStates]:
         """Return one configuration a chain."""
-        chains, x = chains_of(model), state.x
+        chains, x = model.chains(), state.x
         for _ in range(self.k):
             x = chains.sweep(x, generator=generator)
         return NegativePhase(chains.read(x), ChainStates(x.clone()), {})

@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import TwoLayerModel, chains_of
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 
@@ -32,16 +32,16 @@ class Quench:
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
 
-    def init(self, model: TwoLayerModel, n_chains: int, *, generator: Generator) -> NoState:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> NoState:
         """Nothing to remember: every call starts at random states."""
         return NoState()
 
     @torch.no_grad()
     def sample(
-        self, model: TwoLayerModel, state: NoState, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
         """Return one configuration a start."""
-        chains = chains_of(model)
+        chains = model.chains()
         x = chains.random(self.n_chains or positive.v.shape[-2], generator=generator)
         x = chains.sweep(x, beta=self.beta_hot, generator=generator)
         x = chains.sweep(x, generator=generator)

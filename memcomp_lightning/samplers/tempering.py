@@ -1,30 +1,22 @@
 """Parallel tempering: chains at several temperatures that exchange their states."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.samplers.gibbs import Chains, TwoLayerModel, chains_of
+from memcomp_lightning.models.base import Chains, EnergyModel
 from memcomp_lightning.types import Configurations, NegativePhase
-
-
-class TemperedModel(TwoLayerModel, Protocol):
-    """A two-layer model with the energy of joint states."""
-
-    def energy(self, v: Tensor, h: Tensor) -> Tensor:
-        """E(v, h)."""
-        ...
 
 
 class Ladder(NamedTuple):
     """Chains at all temperatures, from the coldest (beta = 1) to the hottest.
 
     Attributes:
-        x: States, ``(*replicas, n_temperatures, n_chains, n_units)``: see :class:`gibbs.Chains`.
+        x: States, ``(*replicas, n_temperatures, n_chains, n_units)``: see ``models.base.Chains``.
         gap: Difference of inverse temperature between neighbours, ``(*replicas, n_temperatures - 1)``.
         swap_rate: Running mean of the accepted share of exchanges, ``(*replicas, n_temperatures - 1)``.
         last_end: The end of the ladder that a state was at last: 1 the coldest, -1 the hottest, 0 none yet;
@@ -79,10 +71,10 @@ class ParallelTempering:
         )
         require(self.adaptation >= 0, "adaptation", self.adaptation, "a number >= 0")
 
-    def init(self, model: TemperedModel, n_chains: int, *, generator: Generator) -> Ladder:
+    def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> Ladder:
         """Start all chains at random states and the gaps equal."""
         n, n_temperatures, replicas = self.n_chains or n_chains, self.n_temperatures, model.replicas
-        x = chains_of(model).random(n_temperatures * n, generator=generator)
+        x = model.chains().random(n_temperatures * n, generator=generator)
         gap = x.new_full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1))
         return Ladder(
             x=x.unflatten(-2, (n_temperatures, n)),
@@ -95,10 +87,10 @@ class ParallelTempering:
 
     @torch.no_grad()
     def sample(
-        self, model: TemperedModel, state: Ladder, positive: Configurations, *, generator: Generator
+        self, model: EnergyModel, state: Ladder, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[Ladder]:
         """Return the coldest configuration of each ladder."""
-        chains = chains_of(model)
+        chains = model.chains()
         for _ in range(self.k):
             state = self._round(chains, state, generator)
         info = {

@@ -15,7 +15,7 @@ from memcomp_lightning.likelihood import (
     log_likelihood_bound,
     log_partition_function,
 )
-from memcomp_lightning.models import DBM, BoltzmannMachine, folded
+from memcomp_lightning.models import DBM, BoltzmannMachine, as_two_layers
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
@@ -74,13 +74,13 @@ def test_the_bound_lies_below_and_is_tight_without_couplings_between_hidden_unit
 
 def test_a_dbm_is_folded_into_an_rbm_of_its_odd_and_even_layers():
     dbm = small_dbm(replicas=(2,)).double()
-    rbm = folded(dbm)
+    rbm = as_two_layers(dbm).rbm
     assert (rbm.n_visible, rbm.n_hidden) == (5 + 2, 3)
     x = binary_states(dbm.n_units, like=dbm.b).expand(2, -1, -1)
     first, second = (x[..., units] for units in dbm.classes)
     torch.testing.assert_close(rbm.energy(first, second), dbm.energy(x[..., :5], x[..., 5:]))
     with pytest.raises(SettingError, match="number of classes of units = 7"):
-        folded(BoltzmannMachine(4, 3))
+        as_two_layers(BoltzmannMachine(4, 3))
 
 
 def test_annealing_of_a_dbm_finds_log_z_from_both_sides():
@@ -92,7 +92,7 @@ def test_annealing_of_a_dbm_finds_log_z_from_both_sides():
     generator = rng.stream(0, "samples")
     x = torch.cat(log_samples(dbm, 200, generator), dim=-1)[..., dbm.classes[0]]
     down = ReverseAis(n_betas=300).estimate(
-        folded(dbm), x, generator=generator, base=base_on_first_class(dbm, base)
+        as_two_layers(dbm).rbm, x, generator=generator, base=base_on_first_class(dbm, base)
     )
     assert bool(((down.log_z - true).abs() < 4 * down.standard_error + 1e-3).all())
     with pytest.raises(SettingError, match="number of classes of units"):
@@ -132,7 +132,7 @@ def test_what_is_too_large_to_enumerate_is_refused():
         log_partition_function(BoltzmannMachine(20, 10))
     with pytest.raises(SettingError, match="units outside the largest class = 17"):
         log_likelihood(BoltzmannMachine(2, 18), torch.zeros(1, 2), torch.zeros(()))
-    with pytest.raises(SettingError, match="units outside the largest class = 18"):
+    with pytest.raises(SettingError, match="units to enumerate = 18"):
         Exact().init(BoltzmannMachine(10, 9), 1, generator=rng.stream(0, "unused"))
     with pytest.raises(SettingError, match="number of hidden units = 11"):
         ExactPosterior().sample(DBM(3, [7, 4]), torch.zeros(1, 3), generator=rng.stream(0, "unused"))

@@ -22,7 +22,6 @@ from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
 from memcomp_lightning.models.enumeration import binary_states  # noqa: E402
 from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noqa: E402
 from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
-from memcomp_lightning.samplers.gibbs import chains_of  # noqa: E402
 from memcomp_lightning.solvers import BruteForce, DimodSolver, Status  # noqa: E402
 from memcomp_lightning.solvers.dmm import DmmSolver  # noqa: E402
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
@@ -128,7 +127,7 @@ def test_the_inverse_temperature_of_samples_is_found(beta):
     """Chains at a known temperature; a value off by a tenth would show."""
     rbm = RBM(7, 5, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "weights"))
     generator = rng.stream(0, "chains")
-    chains = chains_of(rbm)
+    chains = rbm.chains()
     v = chains.random(4001, generator=generator)
     for _ in range(50):
         v = chains.sweep(v, beta=beta, generator=generator)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.models import chains
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.samplers import gibbs
 from memcomp_lightning.testing.conformance import small_rbm
 
 
@@ -24,7 +24,7 @@ def transition_matrix(monkeypatch):
                 return outcomes[len(probabilities) - 1]
 
             monkeypatch.setattr(rng, "bernoulli", scripted)
-            gibbs.sweep(rbm, v, beta=beta, generator=rng.stream(0, "unused"))
+            chains.sweep(rbm, v, beta=beta, generator=rng.stream(0, "unused"))
             p_hidden, p_visible = probabilities
             to_h = (p_hidden * h + (1 - p_hidden) * (1 - h)).prod(-1)
             to_v = (p_visible[0] * v + (1 - p_visible[0]) * (1 - v)).prod(-1)

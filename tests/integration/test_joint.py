@@ -153,7 +153,7 @@ def test_joint_and_greedy_from_the_command_line(memcomp_train: Run) -> None:
         ("positive.tolerance=-1", "tolerance = -1"),
         ("+pretrain.module.posterior=1", "posterior"),
         ("sampler.n_chains=0", "n_chains = 0"),
-        ("sampler=exact", "units outside the largest class = 32"),
+        ("sampler=exact", "units to enumerate = 32"),
     ],
 )
 def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override: str, message: str) -> None:

@@ -8,7 +8,6 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.samplers import CD, PCD, ClampedGibbs, MeanField, ParallelTempering
-from memcomp_lightning.samplers.gibbs import chains_of
 from memcomp_lightning.testing import chi_square_p_value, small_dbm, small_machine, state_counts
 
 N_CHAINS = 60_013
@@ -76,7 +75,7 @@ def test_chains_have_the_boltzmann_distribution_and_those_of_mutants_do_not(make
 @MODELS
 def test_tempered_sweeps_have_the_tempered_distribution(make):
     model, generator = make(), rng.stream(0, "negative_phase")
-    chains = chains_of(model)
+    chains = model.chains()
     x = chains.random(N_CHAINS, generator=generator)
     for _ in range(N_SWEEPS):
         x = chains.sweep(x, beta=0.6, generator=generator)

@@ -7,7 +7,6 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.samplers import CD, Exact, positive_phase
-from memcomp_lightning.samplers.gibbs import random_visible
 from memcomp_lightning.testing.conformance import small_rbm
 
 SIZES = pytest.mark.parametrize("sizes", [(7, 5), (5, 7), (5, 5)], ids=str)
@@ -58,7 +57,7 @@ def test_moments_agree_with_parallel_chains_and_a_mutant_does_not():
     rbm = small_rbm(7, 5).double()
     n = 40_009
     generator = rng.stream(0, "negative_phase")
-    start = random_visible(rbm, n, generator=generator)
+    start = rbm.chains().random(n, generator=generator)
     chains = CD(k=31).sample(rbm, (), positive_phase(rbm, start), generator=generator).configurations
     second_moment = (chains.h**2).mT @ (chains.v**2) / n
     measured = moments(chains)[0]
@@ -73,7 +72,7 @@ def test_moments_agree_with_parallel_chains_and_a_mutant_does_not():
 
 
 def test_error_names_size_of_the_smaller_layer_and_the_limit():
-    message = "size of the smaller layer = 5 is not allowed: expected at most max_units = 3"
+    message = "units to enumerate = 5 is not allowed: expected at most max_units = 3"
     with pytest.raises(SettingError, match=message):
         Exact(max_units=3).init(small_rbm(7, 5), 1, generator=rng.stream(0, "unused"))
     Exact(max_units=5).init(small_rbm(7, 5), 1, generator=rng.stream(0, "unused"))

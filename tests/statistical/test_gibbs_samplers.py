@@ -11,9 +11,9 @@ import torch
 from scipy import stats
 
 from memcomp_lightning import rng
+from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.samplers import CD, PCD, Quench, positive_phase
-from memcomp_lightning.samplers.gibbs import random_visible, sweep
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm
 
@@ -66,7 +66,7 @@ def joint_counts(configurations, seed):
 
 def draw_cd(rbm, seed):
     generator = rng.stream(seed, "negative_phase")
-    v = random_visible(rbm, N_CHAINS, generator=generator)
+    v = rbm.chains().random(N_CHAINS, generator=generator)
     sampler = CD(k=N_SWEEPS)
     state = sampler.init(rbm, N_CHAINS, generator=generator)
     return sampler.sample(rbm, state, positive_phase(rbm, v), generator=generator).configurations
@@ -135,7 +135,7 @@ def test_persistent_chains_mix_by_their_state_alone():
 def test_tempered_sweeps_have_the_tempered_distribution(beta):
     rbm = MODELS["5 x 3"]
     generator = rng.stream(0, "negative_phase")
-    v = random_visible(rbm, N_CHAINS, generator=generator)
+    v = rbm.chains().random(N_CHAINS, generator=generator)
     for _ in range(N_SWEEPS):
         v = sweep(rbm, v, beta=beta, generator=generator)
     assert chi_square_p_value(state_counts(v), visible_probabilities(rbm, beta)) > LEVEL

@@ -8,6 +8,7 @@ import torch
 
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
+from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import DBNPretraining
 from memcomp_lightning.problems import Qubo
@@ -21,7 +22,6 @@ from memcomp_lightning.samplers import (
     ParallelTempering,
     Quench,
 )
-from memcomp_lightning.samplers.gibbs import sweep
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine

@@ -1,0 +1,207 @@
+"""What samplers, likelihoods, solvers and callbacks ask of an energy model."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, Self
+
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+
+from memcomp_lightning.errors import require
+from memcomp_lightning.models.affine import affine
+from memcomp_lightning.types import Configurations
+
+if TYPE_CHECKING:
+    from memcomp_lightning.models.rbm import RBM
+
+Readout = Literal["mean", "sample"]
+
+
+class Block(NamedTuple):
+    """Units without couplings among them, with all that they are coupled to, at the present parameters.
+
+    Attributes:
+        units: Their indices, ``(n_class,)``.
+        neighbours: Indices of the units coupled to any of them, ``(n_neighbours,)``.
+        weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
+        bias: ``(*replicas, n_class)``.
+    """
+
+    units: Tensor
+    neighbours: Tensor
+    weight: Tensor
+    bias: Tensor
+
+    def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
+        """Log odds of each unit given all others."""
+        return affine(x[..., self.neighbours], self.weight, self.bias)
+
+
+class QuadraticForm(NamedTuple):
+    """The energy as ``E(x) = -sum over pairs of coupling x_i x_j - bias . x`` with x = (v, h).
+
+    Attributes:
+        pairs: Coupled units, ``(n_pairs, 2)``; None if each hidden unit is coupled to each visible one.
+        coupling: ``(*replicas, n_pairs)``; ``(*replicas, n_hidden, n_visible)`` where ``pairs`` is None.
+        bias: ``(*replicas, n_visible + n_hidden)``.
+    """
+
+    pairs: Tensor | None
+    coupling: Tensor
+    bias: Tensor
+
+
+class TwoLayers(NamedTuple):
+    """A model whose units fall into two classes, as the RBM between them.
+
+    Attributes:
+        rbm: It has the model's energies, with the first class as its visible units.
+        units: The model's units in the order of the RBM's; None if they are in their places.
+    """
+
+    rbm: "RBM"
+    units: Tensor | None
+
+    def first(self, x: Tensor) -> Tensor:
+        """The part of the first class of something that all units have."""
+        units = slice(self.rbm.n_visible) if self.units is None else self.units[: self.rbm.n_visible]
+        return x[..., units]
+
+
+class Chains(Protocol):
+    """Gibbs chains of one model at its present parameters.
+
+    A chain's state is ``x``, ``(*replicas, n, n_units)``: the visible units of two layers, whose hidden ones are
+    redrawn from them; all units otherwise.
+    """
+
+    free_readout: bool
+    """Whether either layer can be read as means or as samples."""
+
+    def random(self, n: int, *, generator: Generator) -> Tensor:
+        """Draw n states a replica, each unit 0 or 1 with probability 1/2."""
+        ...
+
+    def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
+        """Draw every unit once given the others, at inverse temperature ``beta``, a number or ``(..., n, 1)``."""
+        ...
+
+    def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
+        """Sweep, and return the energy of the new joint state as well, ``(*replicas, n)``."""
+        ...
+
+    def read(self, x: Tensor) -> Configurations:
+        """The states, with the class that was drawn last by its means given the others."""
+        ...
+
+    def from_data(
+        self, positive: Configurations, k: int, *, visible: Readout, hidden: Readout, generator: Generator
+    ) -> Configurations:
+        """Sweep k times from the positive phase, and read the layers as means or samples, with its weights.
+
+        Other readouts than ``visible="sample"``, ``hidden="mean"`` need ``free_readout``.
+        """
+        ...
+
+
+class EnergyModel(Protocol):
+    """Visible and hidden units in {0, 1} with the energy of each joint state, one model a replica.
+
+    The energy is linear in each unit: at values in [0, 1] it is the expected one of independent units.
+    """
+
+    b: nn.Parameter
+    """Visible bias, ``(*replicas, n_visible)``; gives dtype and device."""
+
+    @property
+    def replicas(self) -> tuple[int, ...]:
+        """Leading axes of independent models."""
+        ...
+
+    @property
+    def n_visible(self) -> int:
+        """Number of visible units, which are numbered first."""
+        ...
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of hidden units."""
+        ...
+
+    @property
+    def n_units(self) -> int:
+        """Number of all units."""
+        ...
+
+    @property
+    def n_enumerated(self) -> int:
+        """Units whose states are enumerated where something is exact: all outside the largest class."""
+        ...
+
+    def double(self) -> Self:
+        """The model itself, with its numbers in float64 from now on."""
+        ...
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """Couplings and biases."""
+        ...
+
+    def energy(self, v: Tensor, h: Tensor) -> Tensor:
+        """E(v, h) of each configuration, ``(*replicas, n)``."""
+        ...
+
+    def total_energy(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor:
+        """Sum of ``weight * E(v, h)`` over configurations, ``(*replicas,)``; weights of any sign."""
+        ...
+
+    def centred_total_energy(
+        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    ) -> Tensor:
+        """The same sum; its gradient is that of the centred parametrisation, in the model's own parameters."""
+        ...
+
+    def free_energy(self, v: Tensor) -> Tensor:
+        """F(v), ``(*replicas, n)``; an upper bound where hidden units are coupled to each other."""
+        ...
+
+    def hidden_mean(self, v: Tensor) -> Tensor:
+        """E[h | v], in the mean field where hidden units are coupled to each other."""
+        ...
+
+    def blocks(self) -> Sequence[Block]:
+        """The classes of units, each with its couplings."""
+        ...
+
+    def chains(self) -> Chains:
+        """Gibbs chains at the present parameters."""
+        ...
+
+    def all_configurations(self) -> Configurations:
+        """All states with their probabilities as weights, the largest class by its means given the others."""
+        ...
+
+    def quadratic_form(self) -> QuadraticForm:
+        """Couplings and biases as they stand in the energy."""
+        ...
+
+    def two_layers(self) -> TwoLayers | None:
+        """The RBM with the same energies; None where the units do not fall into two classes."""
+        ...
+
+
+def as_two_layers(model: EnergyModel) -> TwoLayers:
+    """The RBM with the energies of a model.
+
+    Raises:
+        SettingError: The units do not fall into two classes.
+    """
+    layers = model.two_layers()
+    if layers is None:
+        require(
+            False,
+            "number of classes of units",
+            len(model.blocks()),
+            "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
+            "Other machines can be enumerated up to 32 units outside the largest class.",
+        )
+        raise AssertionError
+    return layers
