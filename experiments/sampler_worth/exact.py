@@ -17,7 +17,7 @@ from memcomp_lightning.report.worth import read_worth, weights_path
 IMAGES = {"reduced_mnist": lambda: ReducedMnist(pixels="threshold").load()}
 
 
-def rbm_of(path: Path, n_replicas: int) -> RBM:
+def model_of(path: Path, n_replicas: int) -> RBM:
     """The first replicas of saved weights, those that are reported."""
     state = {name: tensor[:n_replicas] for name, tensor in torch.load(path, weights_only=True).items()}
     _, n_hidden, n_visible = state["weight"].shape
@@ -38,7 +38,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- |")
     for method in worth.methods(given.data_set):
         course = worth.best(given.data_set, method)
-        rbm, begin = rbm_of(weights_path(given.run, course), given.replicas), time.perf_counter()
+        rbm, begin = model_of(weights_path(given.run, course), given.replicas), time.perf_counter()
         log_z = log_partition_function(rbm, max_units=32)
         exact = -log_likelihood(rbm, images.test_v, log_z).mean(-1)
         by_ais = torch.tensor(course.scores[-1][: given.replicas], dtype=torch.float64)

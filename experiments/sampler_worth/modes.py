@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 import torch
-from exact import rbm_of
+from exact import model_of
 
 from memcomp_lightning import rng
 from memcomp_lightning.models import RBM
@@ -36,7 +36,7 @@ def main() -> None:
     print("| RBM trained by | DMM above the mode, median and worst | annealing above the mode |")
     print("| --- | --- | --- |")
     for method in worth.methods(given.data_set):
-        rbm = rbm_of(weights_path(given.run, worth.best(given.data_set, method)), given.replicas)
+        rbm = model_of(weights_path(given.run, worth.best(given.data_set, method)), given.replicas)
         mode, problem, cells = lowest_energy(rbm), from_model(rbm), []
         for solver in (DmmSolver(n_restarts=8), GibbsAnnealing(n_restarts=8)):
             found = solver.minimise(problem, generator=rng.stream(0, "solver")).best_energy

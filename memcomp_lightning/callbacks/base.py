@@ -5,7 +5,7 @@ A module that trains an energy model offers both of these:
 * ``training_step`` returns a dictionary with ``positive`` and ``negative`` (:class:`Configurations`),
   ``contrast`` ``(*replicas,)`` and ``info`` (diagnostics of the sampler), and with ``v``, the visible states of
   the images, if ``positive.v`` is something else; ``validation_step`` returns one with ``v`` of held-out images.
-* Attributes: ``rbm``, the model in training.
+* Attributes: ``model``, the model in training.
 
 A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.modules.Score`) in the
 dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
@@ -13,8 +13,8 @@ dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
 Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
 epoch), ``iterations`` (passes of a stage or layer, default the trainer's ``max_epochs``), ``progress`` (text of
 the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``dbn`` and ``layer`` (the stack that
-``rbm`` is part of), ``models`` (all that are trained, if ``rbm`` is one of several), ``sampler`` (tells whether
-chains persist, default yes), ``active_optimizer``.
+``model`` is part of), ``models`` (all that are trained, if ``model`` is one of several), ``sampler`` (tells
+whether chains persist, default yes), ``active_optimizer``.
 """
 
 from abc import ABC, abstractmethod
@@ -41,18 +41,20 @@ def iteration_of(module: pl.LightningModule) -> int:
     return int(getattr(module, "iteration", module.current_epoch))
 
 
-def rbm_of(module: pl.LightningModule) -> Any:
+def model_of(module: pl.LightningModule) -> Any:
     """The energy model in training.
 
     Raises:
-        TypeError: The module has no attribute ``rbm``.
+        TypeError: The module has no attribute ``model``, or it is no energy model.
     """
-    if not hasattr(module, "rbm"):
+    model = getattr(module, "model", None)
+    if not hasattr(model, "energy"):
+        has = "no attribute 'model'" if model is None else f"a {type(model).__name__} as its 'model'"
         raise TypeError(
-            f"{type(module).__name__} has no attribute 'rbm', the energy model in training, which this callback "
-            "looks at; see memcomp_lightning.callbacks.base for the protocol."
+            f"{type(module).__name__} has {has}: this callback looks at the energy model in training; see "
+            "memcomp_lightning.callbacks.base for the protocol."
         )
-    return module.rbm
+    return model
 
 
 def log_scalars(
@@ -102,8 +104,8 @@ def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_un
     Raises:
         SettingError: Naming callback and size.
     """
-    for rbm in getattr(module, "models", None) or [rbm_of(module)]:
-        n_units = rbm.n_enumerated
+    for model in getattr(module, "models", None) or [model_of(module)]:
+        n_units = model.n_enumerated
         name = type(callback).__name__
         require(
             n_units <= max_units,

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
+    model_of,
     prefix_of,
-    rbm_of,
     required,
     tensorboards,
     write_figure,
@@ -43,12 +43,12 @@ class EnergyHistograms(EveryIterations):
         boards = tensorboards(trainer)
         if not boards:
             return
-        rbm = rbm_of(pl_module)
+        model = model_of(pl_module)
         energies, weights = {}, {}
         for name, phase in (("data", "positive"), ("model", "negative")):
             configurations = required(outputs, phase, self)
             share: Tensor = shares(configurations).double().flatten().cpu()
-            energy: Tensor = rbm.energy(configurations.v, configurations.h).double().flatten().cpu()
+            energy: Tensor = model.energy(configurations.v, configurations.h).double().flatten().cpu()
             energies[name] = energy[share > 0].numpy()
             weights[name] = share[share > 0].numpy() * configurations.v.shape[-2]
         everything = np.concatenate([*energies.values()])

@@ -6,7 +6,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from memcomp_lightning.callbacks.base import LastImages, images_of_step, log_scalars, rbm_of, required
+from memcomp_lightning.callbacks.base import LastImages, images_of_step, log_scalars, model_of, required
 
 
 class FreeEnergyGap(pl.Callback):
@@ -72,5 +72,5 @@ class FreeEnergyGap(pl.Callback):
 
 @torch.no_grad()
 def _free_energy(module: pl.LightningModule, v: Tensor) -> Tensor:
-    free_energy: Tensor = rbm_of(module).free_energy(v)
+    free_energy: Tensor = model_of(module).free_energy(v)
     return free_energy

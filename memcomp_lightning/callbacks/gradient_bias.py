@@ -12,7 +12,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
     log_scalars,
-    rbm_of,
+    model_of,
     require_enumerable,
     required,
 )
@@ -56,18 +56,18 @@ class GradientBias(EveryIterations):
     ) -> None:
         """Keep the model as the sampler meets it."""
         if trainer.is_last_batch and self.is_due(trainer, pl_module):
-            self._before = copy.deepcopy(rbm_of(pl_module))
+            self._before = copy.deepcopy(model_of(pl_module))
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Compare both gradients."""
-        rbm, self._before = self._before, None
-        if rbm is None:
+        model, self._before = self._before, None
+        if model is None:
             return
         positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
         # Enumeration draws nothing; the protocol of samplers asks for a stream.
         generator = rng.stream(0, "gradient_bias")
-        exact = Exact(max_units=MAX_UNITS).sample(rbm, NoState(), positive, generator=generator).configurations
-        cosine, error = compared(gradient(rbm, positive, negative), gradient(rbm, positive, exact))
+        exact = Exact(max_units=MAX_UNITS).sample(model, NoState(), positive, generator=generator).configurations
+        cosine, error = compared(gradient(model, positive, negative), gradient(model, positive, exact))
         log_scalars(pl_module, {"gradient_bias/cosine": cosine, "gradient_bias/relative_error": error})
 
 
@@ -76,9 +76,9 @@ def compared(found: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cosine_similarity(found, wanted, dim=-1), (found - wanted).norm(dim=-1) / wanted.norm(dim=-1)
 
 
-def gradient(rbm: Any, positive: Configurations, negative: Configurations) -> Tensor:
+def gradient(model: Any, positive: Configurations, negative: Configurations) -> Tensor:
     """Gradient of the contrast by all parameters end to end, ``(*replicas, n_parameters)``."""
-    parameters = [parameter for parameter in rbm.parameters() if parameter.requires_grad]
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     with torch.enable_grad():
-        gradients = torch.autograd.grad(contrast(rbm, positive, negative).sum(), parameters)
-    return torch.cat([part.flatten(len(rbm.replicas)) for part in gradients], dim=-1)
+        gradients = torch.autograd.grad(contrast(model, positive, negative).sum(), parameters)
+    return torch.cat([part.flatten(len(model.replicas)) for part in gradients], dim=-1)

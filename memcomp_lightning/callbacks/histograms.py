@@ -20,7 +20,7 @@ class ParameterHistograms(EveryIterations):
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Parameters of the model in training, or of the whole module."""
-        model: Any = getattr(pl_module, "rbm", pl_module)
+        model: Any = getattr(pl_module, "model", pl_module)
         for board in tensorboards(trainer):
             for name, parameter in model.named_parameters():
                 if not parameter.numel():  # biases of no hidden units

@@ -15,7 +15,7 @@ from memcomp_lightning.callbacks.base import (
     images_of_step,
     iteration_of,
     log_scalars,
-    rbm_of,
+    model_of,
     require_enumerable,
     required,
 )
@@ -144,19 +144,19 @@ class LogLikelihood(EveryIterations):
         """Unnormalised log-likelihood of one chunk of held-out images."""
         if self._looks(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
             v = required(outputs, "v", self)
-            self._heldout.append((self._total(rbm_of(pl_module), v, self._bits), v.shape[-2]))
+            self._heldout.append((self._total(model_of(pl_module), v, self._bits), v.shape[-2]))
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Normalise."""
-        rbm = rbm_of(pl_module)
-        method = self._method_for(rbm)
+        model = model_of(pl_module)
+        method = self._method_for(model)
         if method is None:
             return
         train = self._train.images()
-        values = self._partition_function(rbm, method, train)
+        values = self._partition_function(model, method, train)
         log_z = values["log_z"]
         if train is not None:
-            total = self._total(rbm, train, rng.stream(self.seed, "log_likelihood", 0))
+            total = self._total(model, train, rng.stream(self.seed, "log_likelihood", 0))
             values["log_likelihood_train"] = total / train.shape[-2] - log_z
         # A validation in the middle of the pass has judged another model.
         if self._heldout and self._judged_at == trainer.global_step:
@@ -183,7 +183,7 @@ class LogLikelihood(EveryIterations):
 
     def _looks(self, trainer: pl.Trainer, module: pl.LightningModule) -> bool:
         """Whether the present pass ends with a value."""
-        return self.is_due(trainer, module) and self._method_for(rbm_of(module)) is not None
+        return self.is_due(trainer, module) and self._method_for(model_of(module)) is not None
 
     def _method_for(self, model: Any) -> Literal["exact", "ais"] | None:
         """How log Z of a model is found; None if it is not."""
@@ -191,17 +191,17 @@ class LogLikelihood(EveryIterations):
             return self.method
         if model.n_enumerated <= min(QUICKLY_ENUMERATED, self.max_units):
             return "exact"
-        two_layers = len(getattr(model, "classes", "vh")) == 2
+        two_layers = model.two_layers() is not None
         n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
         return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
 
-    def _partition_function(self, rbm: Any, method: str, train: Tensor | None) -> dict[str, Tensor]:
+    def _partition_function(self, model: Any, method: str, train: Tensor | None) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
         if method == "exact":
-            return {"log_z": likelihood.log_partition_function(rbm, max_units=self.max_units)}
+            return {"log_z": likelihood.log_partition_function(model, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
         base = None if train is None else likelihood.base_of(train)
-        estimate = ais.estimate(rbm, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
+        estimate = ais.estimate(model, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
         return {
             "log_z": estimate.log_z,
             "log_z_standard_error": estimate.standard_error,
@@ -209,11 +209,11 @@ class LogLikelihood(EveryIterations):
         }
 
     @staticmethod
-    def _total(rbm: Any, v: Tensor, bits: Generator) -> Tensor:
+    def _total(model: Any, v: Tensor, bits: Generator) -> Tensor:
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
-        log_z = v.new_zeros(rbm.replicas, dtype=torch.float64)
+        log_z = v.new_zeros(model.replicas, dtype=torch.float64)
         v = rng.bernoulli(v, generator=bits)
-        return likelihood.log_likelihood_or_bound(rbm, v, log_z).double().sum(-1)
+        return likelihood.log_likelihood_or_bound(model, v, log_z).double().sum(-1)
 
 
 def _numbers(values: Tensor | None) -> list[float]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, rbm_of, required
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, required
 
 
 class NegativePhaseEnergies(EveryIterations):
@@ -21,14 +21,14 @@ class NegativePhaseEnergies(EveryIterations):
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Energies of the last batch of the pass."""
-        rbm = rbm_of(pl_module)
+        model = model_of(pl_module)
         positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
         log_scalars(
             pl_module,
             {
-                "energy_data": rbm.energy(positive.v, positive.h).mean(-1),
-                "energy_model": rbm.mean_energy(negative),
-                "energy_model_lowest": rbm.energy(negative.v, negative.h).min(-1).values,
+                "energy_data": model.energy(positive.v, positive.h).mean(-1),
+                "energy_model": model.mean_energy(negative),
+                "energy_model_lowest": model.energy(negative.v, negative.h).min(-1).values,
                 "contrast": required(outputs, "contrast", self),
             },
         )

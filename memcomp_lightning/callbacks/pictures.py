@@ -8,7 +8,7 @@ import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, rbm_of, required, tensorboards
+from memcomp_lightning.callbacks.base import EveryIterations, model_of, prefix_of, required, tensorboards
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
 
@@ -73,7 +73,7 @@ class ReceptiveFields(Pictures):
 
     def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
         """Weights of the layer in training times those below."""
-        fields: Tensor = rbm_of(pl_module).weight
+        fields: Tensor = model_of(pl_module).weight
         dbn: Any = getattr(pl_module, "dbn", None)
         layer: Any = getattr(pl_module, "layer", 0)
         layers_below = range(layer) if dbn is not None else ()
@@ -102,14 +102,14 @@ class ModelSamples(Pictures):
 
     def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
         """Run the chains and project them down to the inputs."""
-        rbm = rbm_of(pl_module)
+        model = model_of(pl_module)
         generator = rng.stream(self.seed, "evaluation")
-        chains = rbm.chains()
+        chains = model.chains()
         x = chains.random(self.n_pictures, generator=generator)
         for _ in range(self.n_sweeps):
             x = chains.sweep(x, generator=generator)
         states = chains.read(x)
-        return _images(pl_module, rbm.visible_mean(states.h) if rbm.n_hidden else states.v)
+        return _images(pl_module, model.visible_mean(states.h) if model.n_hidden else states.v)
 
 
 class ChainPictures(Pictures):

@@ -5,7 +5,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 
-from memcomp_lightning.callbacks.base import EveryIterations, images_of_step, log_scalars, rbm_of
+from memcomp_lightning.callbacks.base import EveryIterations, images_of_step, log_scalars, model_of
 
 
 class ReconstructionError(EveryIterations):
@@ -20,6 +20,6 @@ class ReconstructionError(EveryIterations):
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
         """Reconstruct the last batch of the pass."""
         v = images_of_step(outputs, self)
-        rbm = rbm_of(pl_module)
-        error = (v - rbm.visible_mean(rbm.hidden_mean(v))).square().mean((-1, -2))
+        model = model_of(pl_module)
+        error = (v - model.visible_mean(model.hidden_mean(v))).square().mean((-1, -2))
         log_scalars(pl_module, {"reconstruction_error": error})

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, prefix_of, rbm_of, required
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, prefix_of, required
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.types import Configurations
 
@@ -57,7 +57,7 @@ class SamplerDiagnostics(EveryIterations):
         v = negative.v.detach().clone().cpu()  # a sampler of somebody else's may go on in the same tensor
         if self._v is not None:
             values["bits_changed"] = (v - self._v).abs().mean((-1, -2))
-        energy = rbm_of(module).energy(negative.v, negative.h).cpu()
+        energy = model_of(module).energy(negative.v, negative.h).cpu()
         self._v, self._energies = v, [*self._energies, energy][-self.history :]
         if len(self._energies) >= 2 and energy.shape[-1] >= 2:
             series = torch.stack(self._energies, dim=-2)
@@ -106,9 +106,9 @@ def _chains_persist(module: pl.LightningModule) -> bool:
     init = getattr(getattr(module, "sampler", None), "init", None)
     if init is None:
         return True
-    rbm = rbm_of(module)
-    widths = (rbm.n_visible, rbm.n_visible + rbm.n_hidden)
-    return _holds_chains(init(rbm, 1, generator=rng.stream(0, "check")), widths)
+    model = model_of(module)
+    widths = (model.n_visible, model.n_visible + model.n_hidden)
+    return _holds_chains(init(model, 1, generator=rng.stream(0, "check")), widths)
 
 
 def _holds_chains(state: Any, widths: tuple[int, ...]) -> bool:

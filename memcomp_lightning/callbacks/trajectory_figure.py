@@ -7,7 +7,7 @@ import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, rbm_of, tensorboards, write_figure
+from memcomp_lightning.callbacks.base import EveryIterations, model_of, tensorboards, write_figure
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 from memcomp_lightning.problems import Qubo, from_model
@@ -50,7 +50,7 @@ class TrajectoryFigure(EveryIterations):
         """Solve, and draw."""
         if not tensorboards(trainer):
             return
-        problem = _first(from_model(rbm_of(pl_module)))
+        problem = _first(from_model(model_of(pl_module)))
         solution = self.solver.minimise(problem, generator=rng.stream(self.seed, "trajectory"))
         if solution.trajectory is None:
             raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")

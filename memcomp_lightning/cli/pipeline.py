@@ -136,7 +136,7 @@ def _trained(stage: Stage) -> torch.nn.Module:
     if isinstance(module, DBNPretraining | DBMPretraining):
         return module.dbn
     if isinstance(module, BoltzmannPretraining):
-        return module.model
+        return module.machine
     return cast(Classifier, module).network
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
 from memcomp_lightning.objective import Centring, Offsets, contrast, weighted
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
@@ -65,8 +66,13 @@ class EnergyPretraining(StageModule):
 
     @property
     @abstractmethod
-    def models(self) -> Sequence[Any]:
+    def models(self) -> Sequence[EnergyModel]:
         """All energy models that are trained, in order."""
+
+    @property
+    def model(self) -> EnergyModel:
+        """The one in training."""
+        return self.models[self.layer]
 
     @property
     def model_names(self) -> list[str]:
@@ -110,11 +116,6 @@ class EnergyPretraining(StageModule):
         stopped = self.current_epoch == self._passes_done and self.trainer.should_stop
         return n_passes >= self.iterations or (stopped and n_passes >= self._fewest_passes)
 
-    @property
-    def rbm(self) -> Any:
-        """The model in training."""
-        return self.models[self.layer]
-
     def setup(self, stage: str) -> None:
         """Begin with the first model."""
         super().setup(stage)
@@ -138,7 +139,7 @@ class EnergyPretraining(StageModule):
             self._sampler_state, self._offsets = None, None
             self.energy_gaps = [
                 *self.energy_gaps,
-                torch.zeros(self.rbm.replicas, dtype=torch.float32, device="cpu"),
+                torch.zeros(self.model.replicas, dtype=torch.float32, device="cpu"),
             ]
             for callback in self.trainer.early_stopping_callbacks:
                 callback.wait_count, callback.stopped_epoch = 0, 0
@@ -177,7 +178,6 @@ class EnergyPretraining(StageModule):
             ``positive`` and ``negative`` (:class:`Configurations`) and the samplers' ``info``: what the callbacks
             look at.
         """
-        rbm = self.rbm
         with torch.no_grad():
             v = self.visible_of(batch)
             positive, inferred = self.infer(v)
@@ -186,9 +186,9 @@ class EnergyPretraining(StageModule):
             offsets = self.centring.follow(self._offsets, positive)
             self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))
         if self._negative is None or self.sampler.uses_data:
-            self._negative = self._negative_phase(rbm, positive)
+            self._negative = self._negative_phase(positive)
         negative = self._negative
-        gap = contrast(rbm, positive, negative.configurations, self._offsets)
+        gap = contrast(self.model, positive, negative.configurations, self._offsets)
         loss = batch.share * gap.sum()
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
         self._gap = self._gap + batch.share * gap.detach()
@@ -208,15 +208,15 @@ class EnergyPretraining(StageModule):
         """Return the model's visible states ``v`` of held-out images, for the callbacks."""
         return {"v": self.visible_of(batch)}
 
-    def _negative_phase(self, rbm: Any, positive: Configurations) -> NegativePhase[Any]:
+    def _negative_phase(self, positive: Configurations) -> NegativePhase[Any]:
         """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
         generator = self.streams["negative_phase"]
         if self._sampler_state is None:
-            self._sampler_state = self.sampler.init(rbm, positive.v.shape[-2], generator=generator)
+            self._sampler_state = self.sampler.init(self.model, positive.v.shape[-2], generator=generator)
         negative: NegativePhase[Any] | None = None
         one_for_all = self.sampler.shared and self.trainer.world_size > 1
         if self.trainer.is_global_zero or not one_for_all:
-            negative = self.sampler.sample(rbm, self._sampler_state, positive, generator=generator)
+            negative = self.sampler.sample(self.model, self._sampler_state, positive, generator=generator)
         if one_for_all:
             negative = self.trainer.strategy.broadcast(move_data_to_device(negative, "cpu"))
             negative = move_data_to_device(negative, self.device)
@@ -261,6 +261,6 @@ class EnergyPretraining(StageModule):
         if state.get("offsets") is not None:
             self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
         if state["sampler"] is not None:
-            template = self.sampler.init(self.rbm, 1, generator=rng.stream(self.seed, "check"))
+            template = self.sampler.init(self.model, 1, generator=rng.stream(self.seed, "check"))
             chains = {name: tensor.to(self.device) for name, tensor in state["sampler"].items()}
             self._sampler_state = with_tensors(template, chains)

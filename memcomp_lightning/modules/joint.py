@@ -51,17 +51,17 @@ class BoltzmannPretraining(EnergyPretraining):
     ) -> None:
         super().__init__(sampler, iterations=iterations, optimizer=optimizer, centring=centring, seed=seed)
         require_state(sampler.init(model, 1, generator=rng.stream(seed, "check")))
-        self.model = model
+        self.machine = model
         self.positive = MeanField() if positive is None else positive
 
     @property
     def models(self) -> Sequence[BoltzmannMachine]:
         """The machine."""
-        return [self.model]
+        return [self.machine]
 
     def configure_optimizers(self) -> Optimizer:
         """One optimiser for all parameters of the machine."""
-        return self.make_optimizer(self.model.parameters())
+        return self.make_optimizer(self.machine.parameters())
 
     def visible_of(self, batch: Batch) -> Tensor:
         """The images."""
@@ -69,7 +69,7 @@ class BoltzmannPretraining(EnergyPretraining):
 
     def infer(self, v: Tensor) -> PositivePhase:
         """The images, each perhaps several times, with hidden units."""
-        return self.positive.sample(self.model, v, generator=self.streams["positive_phase"])
+        return self.positive.sample(self.machine, v, generator=self.streams["positive_phase"])
 
 
 class DBMPretraining(BoltzmannPretraining):
@@ -110,8 +110,8 @@ class DBMPretraining(BoltzmannPretraining):
         self._give()
 
     def _give(self) -> None:
-        assert isinstance(self.model, DBM)
-        self.model.give(self.dbn)
+        assert isinstance(self.machine, DBM)
+        self.machine.give(self.dbn)
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Those of the DBN, which only receives."""

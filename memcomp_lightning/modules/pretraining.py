@@ -98,7 +98,7 @@ class DBNPretraining(EnergyPretraining):
 
     def infer(self, v: Tensor) -> PositivePhase:
         """The hidden means."""
-        return PositivePhase(positive_phase(self.rbm, v), {})
+        return PositivePhase(positive_phase(self.model, v), {})
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
         """Those of the other layers."""

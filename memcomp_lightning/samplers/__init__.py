@@ -3,17 +3,17 @@
 from memcomp_lightning.optional import on_demand
 from memcomp_lightning.samplers.base import NegativePhaseSampler, positive_phase, tensors_of, with_tensors
 from memcomp_lightning.samplers.cd import CD
-from memcomp_lightning.samplers.clamped import (
+from memcomp_lightning.samplers.exact import Exact
+from memcomp_lightning.samplers.ground_state import GroundState
+from memcomp_lightning.samplers.mode_assisted import ModeAssisted, ModeSchedule
+from memcomp_lightning.samplers.pcd import PCD
+from memcomp_lightning.samplers.positive import (
     ClampedGibbs,
     ExactPosterior,
     MeanField,
     PositivePhase,
     PositivePhaseSampler,
 )
-from memcomp_lightning.samplers.exact import Exact
-from memcomp_lightning.samplers.ground_state import GroundState
-from memcomp_lightning.samplers.mode_assisted import ModeAssisted, ModeSchedule
-from memcomp_lightning.samplers.pcd import PCD
 from memcomp_lightning.samplers.quench import Quench
 from memcomp_lightning.samplers.tempering import ParallelTempering
 

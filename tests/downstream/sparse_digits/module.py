@@ -15,7 +15,7 @@ from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase
 class SparseRBM(pl.LightningModule):
     """Follow the contrast of both phases, and pull hidden means to a target (Lee, Ekanadham & Ng 2008).
 
-    What its steps return, and ``rbm``, are what memcomp_lightning's callbacks look at.
+    What its steps return, and ``model``, are what memcomp_lightning's callbacks look at.
 
     Args:
         n_visible: Number of inputs.
@@ -39,7 +39,7 @@ class SparseRBM(pl.LightningModule):
         seed: int,
     ) -> None:
         super().__init__()
-        self.rbm = RBM(n_visible, n_hidden, generator=rng.stream(seed, "weights"))
+        self.model = RBM(n_visible, n_hidden, generator=rng.stream(seed, "weights"))
         self.sampler = sampler
         self.lr, self.sparsity, self.cost = lr, sparsity, cost
         self._generator = rng.stream(seed, "negative_phase")
@@ -48,13 +48,13 @@ class SparseRBM(pl.LightningModule):
     def training_step(self, batch: list[Tensor], batch_idx: int) -> dict[str, Any]:
         """Loss of a batch of images, ``(n, n_visible)`` in [0, 1]."""
         (v,) = batch
-        positive = positive_phase(self.rbm, v)
+        positive = positive_phase(self.model, v)
         if self._state is None:
-            self._state = self.sampler.init(self.rbm, len(v), generator=self._generator)
-        negative = self.sampler.sample(self.rbm, self._state, positive, generator=self._generator)
+            self._state = self.sampler.init(self.model, len(v), generator=self._generator)
+        negative = self.sampler.sample(self.model, self._state, positive, generator=self._generator)
         self._state = negative.state
-        gap = contrast(self.rbm, positive, negative.configurations)
-        distance = (self.rbm.hidden_mean(v).mean(-2) - self.sparsity).square().sum()
+        gap = contrast(self.model, positive, negative.configurations)
+        distance = (self.model.hidden_mean(v).mean(-2) - self.sparsity).square().sum()
         self.log("sparsity", positive.h.mean(), on_step=False, on_epoch=True)
         return {
             "loss": gap + self.cost * distance,
@@ -70,4 +70,4 @@ class SparseRBM(pl.LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Plain descent; the callback MomentumSchedule sets its momentum."""
-        return torch.optim.SGD(self.rbm.parameters(), lr=self.lr, momentum=0.5)
+        return torch.optim.SGD(self.model.parameters(), lr=self.lr, momentum=0.5)

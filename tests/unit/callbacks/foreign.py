@@ -27,16 +27,16 @@ class TheirRBM(pl.LightningModule):
 
     def __init__(self) -> None:
         super().__init__()
-        self.rbm = RBM(6, 5, weight_init=Gaussian(std=0.3))
+        self.model = RBM(6, 5, weight_init=Gaussian(std=0.3))
         self.their_generator = rng.stream(1, "theirs")
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
         v = batch[0]
-        positive = positive_phase(self.rbm, v)
+        positive = positive_phase(self.model, v)
         sampler = CD(k=1)
-        state = sampler.init(self.rbm, len(v), generator=self.their_generator)
-        negative = sampler.sample(self.rbm, state, positive, generator=self.their_generator)
-        gap = contrast(self.rbm, positive, negative.configurations)
+        state = sampler.init(self.model, len(v), generator=self.their_generator)
+        negative = sampler.sample(self.model, state, positive, generator=self.their_generator)
+        gap = contrast(self.model, positive, negative.configurations)
         score = Score(gap.detach(), torch.tensor(3), len(v))
         return {
             "loss": gap,
@@ -72,14 +72,14 @@ class TheirChains(TheirRBM):
 
     def __init__(self) -> None:
         super().__init__()
-        self.rbm = RBM(6, 5, replicas=(2,), weight_init=Gaussian(std=0.3))
-        self.chains = PCD(n_chains=4).init(self.rbm, 4, generator=self.their_generator)
+        self.model = RBM(6, 5, replicas=(2,), weight_init=Gaussian(std=0.3))
+        self.chains = PCD(n_chains=4).init(self.model, 4, generator=self.their_generator)
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
-        positive = positive_phase(self.rbm, batch[0].expand(2, -1, -1))
-        negative = PCD().sample(self.rbm, self.chains, positive, generator=self.their_generator)
+        positive = positive_phase(self.model, batch[0].expand(2, -1, -1))
+        negative = PCD().sample(self.model, self.chains, positive, generator=self.their_generator)
         self.chains = negative.state
-        gap = contrast(self.rbm, positive, negative.configurations)
+        gap = contrast(self.model, positive, negative.configurations)
         return {
             "loss": gap.sum(),
             "contrast": gap.detach(),

@@ -25,7 +25,7 @@ class Weighted(TheirRBM):
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
         outputs = super().training_step(batch, batch_idx)
-        exact = Exact().sample(self.rbm, NoState(), outputs["positive"], generator=self.their_generator)
+        exact = Exact().sample(self.model, NoState(), outputs["positive"], generator=self.their_generator)
         self.outputs = {**outputs, "negative": exact.configurations}
         return self.outputs
 
@@ -39,8 +39,8 @@ def test_both_histograms_share_their_bins_and_configurations_count_by_weight(tmp
     )
     positive, negative = module.outputs["positive"], module.outputs["negative"]
     with torch.no_grad():
-        of_data = module.rbm.energy(positive.v, positive.h).double().numpy()
-        of_model = module.rbm.energy(negative.v, negative.h).double().numpy()
+        of_data = module.model.energy(positive.v, positive.h).double().numpy()
+        of_model = module.model.energy(negative.v, negative.h).double().numpy()
     edges = np.linspace(*np.sort(np.concatenate((of_data, of_model)))[[0, -1]], 8)
     assert data.bucket_limit == model.bucket_limit
     np.testing.assert_allclose(data.bucket_limit[-7:], edges[1:])

@@ -29,7 +29,7 @@ from memcomp_lightning.callbacks import (
     StageTimes,
     TrajectoryFigure,
 )
-from memcomp_lightning.callbacks.base import rbm_of
+from memcomp_lightning.callbacks.base import model_of
 
 
 def all_callbacks() -> list[pl.Callback]:
@@ -105,7 +105,7 @@ def test_values_are_what_they_claim(tmp_path: Path) -> None:
     module, trainer = fit(tmp_path, all_callbacks(), False)
     v = IMAGES
     with torch.no_grad():
-        rbm, logged = module.rbm, trainer.callback_metrics
+        rbm, logged = module.model, trainer.callback_metrics
         last = v[15:]
         error = (last - rbm.visible_mean(rbm.hidden_mean(last))).square().mean()
         assert logged[f"{PREFIX}/reconstruction_error"] == pytest.approx(float(error), rel=1e-5)
@@ -135,9 +135,13 @@ def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> 
     assert trainer.optimizers[0].param_groups[0]["momentum"] == 0.7
 
 
-def test_a_module_without_an_rbm_is_told_so() -> None:
-    with pytest.raises(TypeError, match=r"LightningModule has no attribute 'rbm'.*protocol"):
-        rbm_of(pl.LightningModule())
+def test_a_module_without_an_energy_model_is_told_so() -> None:
+    module: Any = pl.LightningModule()
+    with pytest.raises(TypeError, match=r"LightningModule has no attribute 'model'.*protocol"):
+        model_of(module)
+    module.model = torch.nn.Linear(2, 3)
+    with pytest.raises(TypeError, match=r"LightningModule has a Linear as its 'model'.*protocol"):
+        model_of(module)
 
 
 @pytest.mark.parametrize(("callback", "missing"), [(ReconstructionError(), "positive"), (FreeEnergyGap(), "v")])

@@ -26,7 +26,7 @@ class Remembers(TheirChains):
     """Keeps parameters and phases of its last step."""
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
-        self.before = {name: tensor.detach().clone() for name, tensor in self.rbm.named_parameters()}
+        self.before = {name: tensor.detach().clone() for name, tensor in self.model.named_parameters()}
         self.outputs = super().training_step(batch, batch_idx)
         return self.outputs
 
@@ -58,9 +58,9 @@ def test_values_are_those_of_the_enumerated_likelihood_at_the_parameters_of_the_
 def test_the_exact_sampler_has_none(tmp_path: Path) -> None:
     class TheirExact(TheirRBM):
         def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
-            positive = positive_phase(self.rbm, batch[0])
-            negative = Exact().sample(self.rbm, NoState(), positive, generator=self.their_generator)
-            loss = contrast(self.rbm, positive, negative.configurations)
+            positive = positive_phase(self.model, batch[0])
+            negative = Exact().sample(self.model, NoState(), positive, generator=self.their_generator)
+            loss = contrast(self.model, positive, negative.configurations)
             return {"loss": loss, "positive": positive, "negative": negative.configurations}
 
     _, trainer = fit(tmp_path, [GradientBias(every=1)], module=TheirExact())
@@ -88,7 +88,7 @@ def test_the_models_own_gradients_stay_as_they_are(tmp_path: Path) -> None:
 
 def test_layers_too_large_to_enumerate_are_refused_before_training(tmp_path: Path) -> None:
     module = TheirRBM()
-    module.rbm = RBM(17, 18, weight_init=Gaussian(std=0.3))
+    module.model = RBM(17, 18, weight_init=Gaussian(std=0.3))
     with pytest.raises(
         SettingError, match=r"units to enumerate for GradientBias = 17 .* at most 16 .*Leave GradientBias"
     ):

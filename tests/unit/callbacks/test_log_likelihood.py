@@ -37,7 +37,7 @@ def log_pseudo_likelihood(rbm: RBM, v: torch.Tensor) -> torch.Tensor:
 def test_values_against_enumeration(tmp_path: Path, kind: type[TheirRBM], method: str) -> None:
     callback = LogLikelihood(every=2, method=method, n_images=7, n_chains=200, n_betas=200, seed=4)
     module, trainer = fit(tmp_path, [callback], module=kind())
-    rbm, logged, prefix = module.rbm, trainer.callback_metrics, kind.__name__
+    rbm, logged, prefix = module.model, trainer.callback_metrics, kind.__name__
     train = IMAGES[10:].expand(*rbm.replicas, -1, -1)  # the last batches that hold at least seven images
     train = rng.bernoulli(train, generator=rng.stream(4, "log_likelihood", 0))
     bits = rng.stream(4, "log_likelihood", 1)

@@ -65,7 +65,7 @@ class Remembers(TheirChains):
     @torch.no_grad()
     def on_train_epoch_end(self) -> None:
         self.seen.append(self.negative.v)
-        self.energies.append(self.rbm.energy(self.negative.v, self.negative.h))
+        self.energies.append(self.model.energy(self.negative.v, self.negative.h))
 
 
 @fits

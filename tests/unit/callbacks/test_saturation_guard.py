@@ -36,7 +36,7 @@ class GoesWrong(TheirRBM):
     @torch.no_grad()
     def on_train_epoch_start(self) -> None:
         if self.current_epoch >= self.at:
-            self.wrong(self.rbm)
+            self.wrong(self.model)
 
     def on_train_epoch_end(self) -> None:
         self.after.append({name: tensor.clone() for name, tensor in self.state_dict().items()})
@@ -53,8 +53,8 @@ def assert_holds(path: Path, weights: dict[str, torch.Tensor]) -> None:
     ("wrong", "named"),
     [
         (lambda rbm: rbm.b[2].fill_(torch.nan), r"rbm\.b has an entry of nan"),
-        (lambda rbm: rbm.weight[1, 2].fill_(-torch.inf), r"rbm\.weight has an entry of (inf|nan)"),
-        (lambda rbm: rbm.c[0].fill_(-300), r"rbm\.c has an entry of 300"),
+        (lambda rbm: rbm.weight[1, 2].fill_(-torch.inf), r"model\.weight has an entry of (inf|nan)"),
+        (lambda rbm: rbm.c[0].fill_(-300), r"model\.c has an entry of 300"),
     ],
     ids=["nan", "infinite", "large"],
 )
@@ -121,7 +121,7 @@ def test_a_module_that_stops_itself_leaves_its_good_weights_too(
 def test_bad_weights_from_the_start_are_said_to_be_so(tmp_path: Path) -> None:
     module = TheirRBM()
     with torch.no_grad():
-        module.rbm.b.fill_(torch.nan)
+        module.model.b.fill_(torch.nan)
     with pytest.raises(DivergedError, match="no good weights to go back to"):
         fit(tmp_path, [SaturationGuard()], module=module)
     assert not (tmp_path / "last_good.pt").exists()

@@ -35,7 +35,7 @@ def test_figure_is_the_path_through_the_first_replica(tmp_path: Path, monkeypatc
     module, _ = fit(tmp_path, [callback], tensorboard(tmp_path), TheirChains())
     assert len(events_in(tmp_path).Images("TheirChains/trajectory")) == len(drawn) == 2
     first = RBM(6, 5)
-    first.load_state_dict({name: tensor[0] for name, tensor in module.rbm.state_dict().items()})
+    first.load_state_dict({name: tensor[0] for name, tensor in module.model.state_dict().items()})
     solution = SOLVER.minimise(from_model(first), generator=rng.stream(3, "trajectory"))
     assert solution.trajectory is not None
     trajectory, title = drawn[-1]
