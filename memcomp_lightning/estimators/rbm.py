@@ -186,9 +186,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             training = self._training
             for group in training.optimizer.param_groups:
                 group["lr"] = self.learning_rate
-            if training.sampler != self._negative_phase():
-                training.sampler, training.state = self._negative_phase(), None
-            training.centring = self._centring()
+            training.go_on_with(self._negative_phase(), self._centring())
             # Data of another precision than the model's take the model's.
             X = X.astype(self.components_.dtype, copy=False)
             weight = None if weight is None else weight.astype(X.dtype)

@@ -3,10 +3,11 @@
 import math
 import sys
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
+import lightning.pytorch as pl
 import torch
 from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
@@ -16,10 +17,11 @@ from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
-from memcomp_lightning.objective import Centring, Offsets, contrast, weighted
+from memcomp_lightning.objective import Centring, Offsets, weighted
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
 from memcomp_lightning.samplers.base import require_sampler
-from memcomp_lightning.types import Batch, Configurations, NegativePhase
+from memcomp_lightning.training import EnergyStep, StepState
+from memcomp_lightning.types import Batch, NegativePhase
 
 
 class EnergyPretraining(StageModule):
@@ -57,9 +59,7 @@ class EnergyPretraining(StageModule):
         self.sampler = sampler
         self.centring = centring
         self.energy_gaps: list[Tensor] = []
-        self._sampler_state: Any = None
-        self._offsets: Offsets | None = None
-        self._negative: NegativePhase[Any] | None = None
+        self._state = StepState()
         self._gap: Tensor | float = 0.0
         self._begun_at = [0]
         self._fewest_passes = 0
@@ -136,7 +136,7 @@ class EnergyPretraining(StageModule):
             self.trainer.should_stop = False
             self._begun_at.append(self.current_epoch)
         if self.iteration == 0:
-            self._sampler_state, self._offsets = None, None
+            self._state = StepState()
             self.energy_gaps = [
                 *self.energy_gaps,
                 torch.zeros(self.model.replicas, dtype=torch.float32, device="cpu"),
@@ -182,19 +182,17 @@ class EnergyPretraining(StageModule):
             v = self.visible_of(batch)
             positive, inferred = self.infer(v)
             positive = weighted(positive, batch.weight)
-        if self._negative is None and self.centring is not None:
-            offsets = self.centring.follow(self._offsets, positive)
-            self._offsets = Offsets(*(self._mean_over_processes(offset) for offset in offsets))
-        if self._negative is None or self.sampler.uses_data:
-            self._negative = self._negative_phase(positive)
-        negative = self._negative
-        gap = contrast(self.model, positive, negative.configurations, self._offsets)
+        processes = _OfTrainer(self.trainer, self.device)
+        step = EnergyStep(sampler=self.sampler, centring=self.centring, processes=processes)
+        generator = self.streams["negative_phase"]
+        gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
         loss = batch.share * gap.sum()
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
-        self._gap = self._gap + batch.share * gap.detach()
+        gap_so_far = self._gap + batch.share * gap.detach()
+        self._gap = gap_so_far
         if batch.closes_step:
-            self.energy_gaps[self.layer] = self._mean_over_processes(self._gap)
-            self._negative, self._gap = None, 0.0
+            self.energy_gaps[self.layer] = processes.mean(gap_so_far)
+            self._state, self._gap = self._state.after_update(), 0.0
         return {
             "loss": loss.detach(),
             "contrast": gap.detach(),
@@ -208,33 +206,10 @@ class EnergyPretraining(StageModule):
         """Return the model's visible states ``v`` of held-out images, for the callbacks."""
         return {"v": self.visible_of(batch)}
 
-    def _negative_phase(self, positive: Configurations) -> NegativePhase[Any]:
-        """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
-        generator = self.streams["negative_phase"]
-        if self._sampler_state is None:
-            self._sampler_state = self.sampler.init(self.model, positive.v.shape[-2], generator=generator)
-        negative: NegativePhase[Any] | None = None
-        one_for_all = self.sampler.shared and self.trainer.world_size > 1
-        if self.trainer.is_global_zero or not one_for_all:
-            negative = self.sampler.sample(self.model, self._sampler_state, positive, generator=generator)
-        if one_for_all:
-            negative = self.trainer.strategy.broadcast(move_data_to_device(negative, "cpu"))
-            negative = move_data_to_device(negative, self.device)
-        if negative is None:
-            raise RuntimeError("the process of rank 0 sent no negative phase")
-        self._sampler_state = negative.state
-        return negative
-
-    def _mean_over_processes(self, value: Tensor | float) -> Tensor:
-        value = torch.as_tensor(value, dtype=torch.float32) if isinstance(value, float) else value
-        if self.trainer.world_size == 1:
-            return value
-        return cast(Tensor, self.trainer.strategy.reduce(value, reduce_op="mean"))
-
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains, the offsets and the energy gaps."""
-        chains = None if self._sampler_state is None else tensors_of(self._sampler_state)
-        offsets = None if self._offsets is None else self._offsets._asdict()
+        chains = None if self._state.sampler is None else tensors_of(self._state.sampler)
+        offsets = None if self._state.offsets is None else self._state.offsets._asdict()
         state = {
             "sampler": chains,
             "offsets": offsets,
@@ -259,8 +234,32 @@ class EnergyPretraining(StageModule):
         self._take_begun_at(state)
         self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
         if state.get("offsets") is not None:
-            self._offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
+            offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})
+            self._state = self._state._replace(offsets=offsets)
         if state["sampler"] is not None:
             template = self.sampler.init(self.model, 1, generator=rng.stream(self.seed, "check"))
             chains = {name: tensor.to(self.device) for name, tensor in state["sampler"].items()}
-            self._sampler_state = with_tensors(template, chains)
+            self._state = self._state._replace(sampler=with_tensors(template, chains))
+
+
+class _OfTrainer:
+    """The processes of a trainer."""
+
+    def __init__(self, trainer: pl.Trainer, device: torch.device) -> None:
+        self._trainer, self._device = trainer, device
+
+    def mean(self, value: Tensor) -> Tensor:
+        """The mean over all of them."""
+        if self._trainer.world_size == 1:
+            return value
+        return cast(Tensor, self._trainer.strategy.reduce(value, reduce_op="mean"))
+
+    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
+        """What the process of rank 0 makes, in all of them."""
+        if self._trainer.world_size == 1:
+            return make()
+        made = make() if self._trainer.is_global_zero else None
+        made = self._trainer.strategy.broadcast(move_data_to_device(made, "cpu"))
+        if made is None:
+            raise RuntimeError("the process of rank 0 sent no negative phase")
+        return cast(NegativePhase[Any], move_data_to_device(made, self._device))

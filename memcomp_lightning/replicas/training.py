@@ -7,7 +7,7 @@ they leave out looks at training, which costs more than an update of a small net
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Generator, Tensor, nn
@@ -18,14 +18,14 @@ from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.callbacks.learning_rate_decay import set_learning_rate
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.models import DBN, RBM, BoltzmannMachine
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, EnergyModel
 from memcomp_lightning.modules import DivergedError, Loss, OptimizerFactory, cross_entropy, joined
 from memcomp_lightning.modules.stage import diverged_parameter
-from memcomp_lightning.objective import Centring, Offsets, contrast, weighted
+from memcomp_lightning.objective import Centring, weighted
 from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhaseSampler, positive_phase
-from memcomp_lightning.samplers.base import require_sampler
-from memcomp_lightning.types import Batch, Configurations, NegativePhase
+from memcomp_lightning.training import EnergyStep, StepState
+from memcomp_lightning.types import Batch, Configurations
 
 
 class Rates(NamedTuple):
@@ -201,12 +201,11 @@ class ContrastTraining:
 
     Attributes:
         passes_done: How many.
-        state: Of the sampler; None before the first update.
     """
 
     def __init__(
         self,
-        model: Any,
+        model: EnergyModel,
         positive_of: Callable[[Tensor], Configurations],
         sampler: NegativePhaseSampler[Any, Any],
         *,
@@ -214,17 +213,25 @@ class ContrastTraining:
         centring: Centring | None,
         generator: Generator,
     ) -> None:
-        require_sampler("sampler", sampler)
         self.model = model
         self.positive_of = positive_of
-        self.sampler = sampler
+        self.step = EnergyStep(sampler=sampler, centring=centring)
         self.rates = rates
-        self.centring = centring
         self.generator = generator
         self.optimizer = rates.optimizer(model.parameters())
         self.passes_done = 0
-        self.state: Any = None
-        self._offsets: Offsets | None = None
+        self._state = StepState()
+
+    @property
+    def state(self) -> Any:
+        """Of the sampler."""
+        return self._state.sampler
+
+    def go_on_with(self, sampler: NegativePhaseSampler[Any, Any], centring: Centring | None) -> None:
+        """Take other settings for the passes that follow; another sampler starts anew."""
+        if sampler != self.step.sampler:
+            self._state = self._state._replace(sampler=None)
+        self.step = EnergyStep(sampler=sampler, centring=centring)
 
     def run_pass(self, batches: Iterable[Batch]) -> Pass:
         """Update the model by each step of the batches, once."""
@@ -232,26 +239,19 @@ class ContrastTraining:
             return self._run_pass(batches)
 
     def _run_pass(self, batches: Iterable[Batch]) -> Pass:
-        model, sampler = self.model, self.sampler
         self.rates.begin_pass(self.optimizer, self.passes_done)
-        negative: NegativePhase[Any] | None = None
+        state = self._state
         for batch in batches:
             with torch.no_grad():
                 positive = weighted(self.positive_of(batch.v), batch.weight)
-            if self.state is None:
-                self.state = sampler.init(model, positive.v.shape[-2], generator=self.generator)
-            if negative is None and self.centring is not None:
-                self._offsets = self.centring.follow(self._offsets, positive)
-            if negative is None or sampler.uses_data:
-                negative = sampler.sample(model, self.state, positive, generator=self.generator)
-                self.state = negative.state
-            gap = contrast(model, positive, negative.configurations, self._offsets)
+            gap, _, state = self.step.contrast(self.model, positive, state, generator=self.generator)
             (batch.share * gap.sum()).backward()
             if batch.closes_step:
                 self.optimizer.step()
                 self.optimizer.zero_grad()
-                negative = None
+                state = state.after_update()
         self.passes_done += 1
+        self._state = state
         return Pass(self.passes_done, self.state, positive)
 
 
@@ -260,7 +260,7 @@ def _passes(training: ContrastTraining, batches: Batches, epochs: range, where: 
     for epoch in epochs:
         batches.set_epoch(epoch)
         yield training.run_pass(batches)
-    require_finite(training.model, where)
+    require_finite(cast(nn.Module, training.model), where)
 
 
 class Backpropagation:

@@ -1,0 +1,109 @@
+"""One update of an energy model: what Lightning's loop and the bare loop on the replica axis have in common."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from torch import Generator, Tensor
+
+from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
+from memcomp_lightning.types import Configurations, NegativePhase
+
+
+class Processes(Protocol):
+    """The processes that share an update, each with images of its own."""
+
+    def mean(self, value: Tensor) -> Tensor:
+        """The mean over all of them."""
+        ...
+
+    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
+        """What the first one makes, in all of them."""
+        ...
+
+
+class OneProcess:
+    """There are no others."""
+
+    def mean(self, value: Tensor) -> Tensor:
+        """The value itself."""
+        return value
+
+    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
+        """What is made here."""
+        return make()
+
+
+_ALONE = OneProcess()
+
+
+class StepState(NamedTuple):
+    """What the training of a model carries from one batch of images to the next.
+
+    Attributes:
+        sampler: State of the sampler; None before the first update.
+        offsets: Centres of the units; None before the first update, and without centring.
+        negative: Negative phase of an update whose images are not all in yet.
+    """
+
+    sampler: Any = None
+    offsets: Offsets | None = None
+    negative: NegativePhase[Any] | None = None
+
+    def after_update(self) -> "StepState":
+        """The optimiser has stepped: the next batch begins another update."""
+        return self._replace(negative=None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnergyStep:
+    r"""The contrast that an update follows, ``mean E(positive) - mean E(negative)``, batch by batch.
+
+    The images of an update may come in several batches. The first one moves the offsets; one negative phase serves
+    all of them, unless the sampler starts at the data.
+
+    Attributes:
+        sampler: Supplies the negative phase.
+        centring: Settings of the centred gradient; None follows the plain one.
+        processes: Those that share the update.
+    """
+
+    sampler: NegativePhaseSampler[Any, Any]
+    centring: Centring | None = None
+    processes: Processes = _ALONE
+
+    def __post_init__(self) -> None:
+        require_sampler("sampler", self.sampler)
+
+    def contrast(
+        self, model: EnergyModel, positive: Configurations, state: StepState, *, generator: Generator
+    ) -> tuple[Tensor, NegativePhase[Any], StepState]:
+        """Return the contrast ``(*replicas,)``, whose gradient is followed, the negative phase, and the new state.
+
+        Args:
+            model: The energy model; not changed.
+            positive: The positive phase of the batch, with its weights.
+            state: What the call before returned, ``after_update()`` where the update was complete.
+            generator: Random stream of the negative phase.
+        """
+        offsets, negative = state.offsets, state.negative
+        if negative is None and self.centring is not None:
+            offsets = Offsets(*map(self.processes.mean, self.centring.follow(offsets, positive)))
+        if negative is None or self.sampler.uses_data:
+            negative = self._negative_phase(model, positive, state.sampler, generator)
+        gap = contrast(model, positive, negative.configurations, offsets)
+        return gap, negative, StepState(negative.state, offsets, negative)
+
+    def _negative_phase(
+        self, model: EnergyModel, positive: Configurations, state: Any, generator: Generator
+    ) -> NegativePhase[Any]:
+        """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
+        if state is None:
+            state = self.sampler.init(model, positive.v.shape[-2], generator=generator)
+
+        def sample() -> NegativePhase[Any]:
+            return self.sampler.sample(model, state, positive, generator=generator)
+
+        return self.processes.from_first(sample) if self.sampler.shared else sample()
