@@ -107,6 +107,32 @@ def global_rng_untouched():
     return _global_rng_untouched
 
 
+@contextlib.contextmanager
+def _threads(n):
+    before = torch.get_num_threads()
+    torch.set_num_threads(n)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.fixture
+def threads():
+    """A context manager in which torch computes in so many threads."""
+    return _threads
+
+
+@pytest.fixture(autouse=True)
+def _guard_threads():
+    before = torch.get_num_threads()
+    yield
+    after = torch.get_num_threads()
+    torch.set_num_threads(before)
+    if after != before:
+        pytest.fail(f"the number of torch's threads was changed from {before} to {after}, and not back")
+
+
 @pytest.fixture
 def allow_global_rng():
     """For a test of third-party code that draws from the global random streams."""

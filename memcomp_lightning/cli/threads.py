@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import torch
 from omegaconf import DictConfig
@@ -11,6 +11,17 @@ from memcomp_lightning.cli.build import Stage
 
 WORTH_THREADS = 2**22
 """Products of a unit and a weight in an update from which a second thread helps: about a millisecond."""
+
+
+@contextmanager
+def in_one_thread() -> Iterator[None]:
+    """Compute in one thread, and then in as many as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager
@@ -27,10 +38,6 @@ def threads_for(stage: Stage, config: DictConfig) -> Iterator[None]:
     n_train, size = stage.data.n_train, config[stage.module.stage].batch_size
     n_rows = min(n_train, size or n_train, config.data.chunk_size)
     n_products = n_rows * max(parameter.numel() for parameter in stage.module.parameters())
-    before = torch.get_num_threads()
-    if "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS:
-        torch.set_num_threads(1)
-    try:
+    alone = "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS
+    with in_one_thread() if alone else nullcontext():
         yield
-    finally:
-        torch.set_num_threads(before)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.cli.threads import in_one_thread
 from memcomp_lightning.cli.units import Progress, rates_of
 from memcomp_lightning.cli.worth_measures import gradient_bias, mean_gradient, measure_of, without_diverged
 from memcomp_lightning.data import Batches
@@ -119,7 +120,11 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
 
     On one thread, and seconds are those of the processor: methods are compared by them while others run beside.
     """
-    torch.set_num_threads(1)
+    with in_one_thread():
+        return _run_job(job, progress)
+
+
+def _run_job(job: Job, progress: Progress) -> list[Course]:
     config = OmegaConf.create(job.config)
     plans = []
     for seed in range(job.n_replicas):

@@ -411,32 +411,20 @@ def compiled(problem, begin, field, n_steps=150):
     return bits(cpu.run(field, field.integrator, problem, begin, **settings))
 
 
-@pytest.fixture
-def two_threads():
-    """A function that runs another one on two threads."""
-
-    def run(function, *arguments):
-        torch.set_num_threads(2)
-        try:
-            return function(*arguments)
-        finally:
-            torch.set_num_threads(1)
-
-    yield run
-    torch.set_num_threads(1)
-
-
 EVERY_LAYOUT = ["bipartite 17 + 11", "listed", "pairs and longer clauses"]
 
 
 @pytest.mark.parametrize("name", EVERY_LAYOUT)
 @pytest.mark.parametrize("field", [ClauseField(noise=0.1), BondField()], ids=["clauses", "bonds"])
-def test_number_of_threads_does_not_change_a_bit(field, name, two_threads):
+def test_number_of_threads_does_not_change_a_bit(field, name, threads):
     problem = EVERY[name]
     if name in CLAUSES and isinstance(field, BondField):
         problem = problem.without_longer()
     begin = start(problem, 70, field)
-    one, two = compiled(problem, begin, field), two_threads(compiled, problem, begin, field)
+    with threads(1):
+        one = compiled(problem, begin, field)
+    with threads(2):
+        two = compiled(problem, begin, field)
     assert all(a.equal(b) for a, b in zip(one, two, strict=True))
 
 

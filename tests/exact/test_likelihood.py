@@ -116,14 +116,12 @@ def test_blocks_need_not_divide_the_states(block, compiled):
     assert_same(prefix_log_weights(layers, n_second=2, block=block, compiled=compiled), whole)
 
 
-def test_threads_do_the_same():
+def test_threads_do_the_same(threads):
     layers = layers_of(small_rbm(13, 11, replicas=(3,)))
-    alone = prefix_log_weights(layers, n_second=3, block=5)
-    torch.set_num_threads(2)
-    try:
+    with threads(1):
+        alone = prefix_log_weights(layers, n_second=3, block=5)
+    with threads(2):
         assert prefix_log_weights(layers, n_second=3, block=5).equal(alone)
-    finally:
-        torch.set_num_threads(1)
 
 
 @pytest.mark.parametrize("std", [0.1, 3.0, 30.0])
@@ -150,17 +148,17 @@ def test_fields_at_the_edge_of_exp():
             assert_same(ours, true)
 
 
-def test_too_large_a_layer_is_refused_with_sizes_and_time():
+def test_too_large_a_layer_is_refused_with_sizes_and_time(threads):
     message = (
         r"^size of the smaller layer = 29 is not allowed: expected at most max_units = 25 to enumerate a 784x29 "
         r"RBM\. All its states would take about 1\.4 minutes on 1 CPU threads: raise max_units \(at most 32\)"
     )
     for function in (log_partition_function, lambda rbm: kl_divergence(rbm, torch.zeros(2, 784))):
-        with pytest.raises(SettingError, match=message):
+        with pytest.raises(SettingError, match=message), threads(1):
             function(RBM(784, 29))
-    with pytest.raises(SettingError, match=r"size of the smaller layer = 5 .* about 4e-08 seconds"):
+    with pytest.raises(SettingError, match=r"size of the smaller layer = 5 .* about 4e-08 seconds"), threads(1):
         log_partition_function(small_rbm(), max_units=4)
-    with pytest.raises(SettingError, match=r"about 3\.7e\+286 years"):
+    with pytest.raises(SettingError, match=r"about 3\.7e\+286 years"), threads(1):
         log_partition_function(RBM(1103, 1101))
     for wrong in (0, 33, 2.5):
         with pytest.raises(SettingError, match=f"^max_units = {wrong} is not allowed: expected an integer"):

@@ -195,12 +195,9 @@ def test_changes_no_result(name: str, work: Callable[[], list[torch.Tensor]]) ->
 
 
 @pytest.mark.parametrize("work", WORK)
-def test_nor_does_the_number_of_threads(work: Callable[[], list[torch.Tensor]]) -> None:
-    plain, before = work(), torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+def test_nor_does_the_number_of_threads(work: Callable[[], list[torch.Tensor]], threads: Any) -> None:
+    plain = work()
+    with threads(2):
         found = work()
-    finally:
-        torch.set_num_threads(before)
     for one, other in zip(found, plain, strict=True):
         torch.testing.assert_close(one, other)

@@ -202,4 +202,4 @@ def test_small_updates_take_one_thread(
     monkeypatch.setattr(torch, "set_num_threads", seen.add)
     outcome = memcomp_train(*FAST, "sampler=cd", f"model.hidden_sizes=[{hidden}]", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
-    assert seen == {n_threads, 3}
+    assert seen == ({1, 3} if n_threads == 1 else set())
