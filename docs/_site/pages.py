@@ -304,9 +304,16 @@ def public_names(module: str) -> list[tuple[str, str]]:
 
 
 def exported(package: Path) -> list[str]:
-    """Return ``__all__`` without importing anything; a tuple of names may be unpacked into it."""
+    """Return ``__all__``, and what is imported on demand, without importing anything.
+
+    A tuple of names may be unpacked into ``__all__``.
+    """
     tuples: dict[str, list[str]] = {}
+    on_demand: list[str] = []
     for node in ast.parse(package.read_text()).body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+            modules = [argument for argument in node.value.args if isinstance(argument, ast.Dict)]
+            on_demand += [key.value for keys in modules for key in keys.keys if isinstance(key, ast.Constant)]
         if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple | ast.List):
             continue
         names: list[str] = []
@@ -317,7 +324,7 @@ def exported(package: Path) -> list[str]:
                 names.append(str(item.value))
         if isinstance(node.targets[0], ast.Name):
             tuples[node.targets[0].id] = names
-    return tuples["__all__"]
+    return list(dict.fromkeys([*tuples["__all__"], *on_demand]))
 
 
 def defined(path: Path) -> list[str]:

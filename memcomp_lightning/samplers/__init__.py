@@ -37,4 +37,4 @@ __all__ = [
     "with_tensors",
 ]
 
-__getattr__ = on_demand(__name__, dict.fromkeys(("AnnealerSamples", "maximum_pseudo_likelihood_beta"), "annealer"))
+__getattr__ = on_demand(__name__, {"AnnealerSamples": "annealer", "maximum_pseudo_likelihood_beta": "annealer"})
