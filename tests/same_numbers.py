@@ -58,7 +58,7 @@ COMMANDS = {
         for name in ("dmm", "dmm_bond", "annealing", "alternating_descent", "brute_force")
     },
 }
-NOT_COMPARED = ("_target_", "seconds", "wall_time", "time", "memcomp_lightning", "source", "file", "path", "version")
+NOT_COMPARED = ("_target_", "seconds", "time", "memcomp_lightning", "source", "file", "path", "version")
 
 
 def problem() -> str:
