@@ -191,7 +191,7 @@ class LogLikelihood(EveryIterations):
             return self.method
         if model.n_enumerated <= min(QUICKLY_ENUMERATED, self.max_units):
             return "exact"
-        two_layers = model.two_layers() is not None
+        two_layers = len(model.classes) == 2
         n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
         return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
 

@@ -19,7 +19,7 @@ _NUMBERS = 2**23
 
 def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
     """A base of visible units as one of the units of the first class, zero for the hidden ones among them."""
-    units = model.blocks()[0].units
+    units = model.classes[0]
     wide = base.new_zeros(*base.shape[:-1], model.n_units)
     wide[..., : model.n_visible] = base
     return wide[..., units]

@@ -15,7 +15,7 @@ from memcomp_lightning.likelihood.boltzmann import (
 )
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.base import EnergyModel, as_two_layers
 from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
 
@@ -246,8 +246,7 @@ def _binary(model: EnergyModel, v: Tensor) -> Tensor:
 
 def _as_rbm(model: EnergyModel) -> RBM | None:
     """The model if its two classes are the visible and the hidden units: sums over h have a closed form then."""
-    layers = model.two_layers()
-    return layers.rbm if layers is not None and layers.units is None else None
+    return as_two_layers(model).rbm if model.quadratic_form().pairs is None else None
 
 
 def _double(model: RBM) -> tuple[Tensor, Tensor, Tensor]:

@@ -167,6 +167,11 @@ class EnergyModel(Protocol):
         """E[h | v], in the mean field where hidden units are coupled to each other."""
         ...
 
+    @property
+    def classes(self) -> Sequence[Tensor]:
+        """Indices of the units of each class."""
+        ...
+
     def blocks(self) -> Sequence[Block]:
         """The classes of units, each with its couplings."""
         ...
@@ -199,7 +204,7 @@ def as_two_layers(model: EnergyModel) -> TwoLayers:
         require(
             False,
             "number of classes of units",
-            len(model.blocks()),
+            len(model.classes),
             "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
             "Other machines can be enumerated up to 32 units outside the largest class.",
         )

@@ -164,10 +164,15 @@ class RBM(nn.Module):
         """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.visible_field(h), beta))
 
+    @property
+    def classes(self) -> list[Tensor]:
+        """Indices of the visible and of the hidden units."""
+        units = torch.arange(self.n_units, device=self.b.device)
+        return [units[: self.n_visible], units[self.n_visible :]]
+
     def blocks(self) -> list[Block]:
-        """The visible and the hidden units."""
-        units = torch.arange(self.n_visible + self.n_hidden, device=self.b.device)
-        first, second = units[: self.n_visible], units[self.n_visible :]
+        """The visible and the hidden units, with their couplings."""
+        first, second = self.classes
         return [Block(first, second, self.weight.mT, self.b), Block(second, first, self.weight, self.c)]
 
     def chains(self) -> TwoLayerChains:

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice, require_parts
-from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.base import EnergyModel, as_two_layers
 from memcomp_lightning.problems.from_model import from_model
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
@@ -70,12 +70,10 @@ def problem_of(model: EnergyModel) -> tuple[Qubo, Tensor | None]:
     A machine whose couplings fill most of the matrix between two classes, a DBM, is posed as an RBM: solvers are
     much faster on a matrix than on a list of pairs.
     """
-    pairs, layers = model.quadratic_form().pairs, model.two_layers()
-    if pairs is None or layers is None or layers.units is None:
-        return from_model(model), None
-    if len(pairs) <= 0.5 * layers.rbm.n_visible * layers.rbm.n_hidden:
-        return from_model(model), None
-    return from_model(layers.rbm), layers.units.argsort()
+    pairs, classes = model.quadratic_form().pairs, model.classes
+    if pairs is not None and len(classes) == 2 and len(pairs) > 0.5 * len(classes[0]) * len(classes[1]):
+        return from_model(as_two_layers(model).rbm), torch.cat(list(classes)).argsort()
+    return from_model(model), None
 
 
 def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
