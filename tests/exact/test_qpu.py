@@ -60,6 +60,8 @@ def test_an_annealer_behind_the_composite_of_ocean_is_solver_and_sampler():
     behind = EmbeddingComposite(Annealer(sweeps=50), embedding_parameters={"random_seed": 1})
     given = {"num_reads": 6, "return_embedding": False}
     check_sampler(AnnealerSamples(sampler=behind, parameters=given, beta="estimate"))
+    cold = Annealer(beta=(0.1, 50.0), sweeps=500)
+    behind, given = EmbeddingComposite(cold, embedding_parameters={"random_seed": 1}), given | {"num_reads": 40}
     qubo, generator = from_model(rbm()), rng.stream(0, "solver")
     found = DimodSolver(sampler=behind, parameters=given).minimise(qubo, generator=generator)
     exact = BruteForce().minimise(qubo, generator=generator)
@@ -72,7 +74,8 @@ def test_ground_states_come_back_to_their_units(make, kind):
     """Units, spins and gauges are undone: the best read is the optimum, and each read has the energy it says."""
     qubo = from_model(make())
     exact = BruteForce().minimise(qubo, generator=rng.stream(0, "unused"))
-    found = QpuSampler(Annealer(kind), n_gauges=4).sample(to_bqm(qubo), num_reads=40, seed=3)
+    cold = Annealer(kind, beta=(0.1, 50.0), sweeps=500)
+    found = QpuSampler(cold, n_gauges=4).sample(to_bqm(qubo), num_reads=40, seed=3)
     assert len(found) == 40
     assert found.first.energy == pytest.approx(float(exact.best_energy), abs=1e-5)
     best = torch.tensor([[float(found.first.sample[unit]) for unit in range(qubo.n)]])
@@ -132,16 +135,23 @@ def test_missing_qubits_are_avoided_or_cost_couplings():
 
 
 def test_what_is_pruned_is_not_coupled():
-    """The samples are those of the model without the lost couplings."""
-    qubo = from_model(rbm(16, 16, std=2.0))
-    broken = QpuSampler(Annealer("chimera", [4, 4, 4])).layout(to_bqm(qubo)).chains[0][1]
-    sampler = QpuSampler(Annealer("chimera", [4, 4, 4], broken_nodes=[broken]), faulty="prune")
-    kept = to_bqm(qubo).spin.copy()
-    kept.remove_interactions_from(sampler.layout(to_bqm(qubo)).uncoupled)
-    found = sampler.sample(to_bqm(qubo), num_reads=60, seed=0)
-    best = min(kept.energies((found.record.sample * 2 - 1, found.variables)))
-    reference = SimulatedAnnealingSampler().sample(kept, num_reads=200, seed=1).first.energy
-    assert best == pytest.approx(reference, rel=1e-6)
+    """The annealer is given the couplings of the model without the lost ones, times one factor, in some gauge."""
+    bqm = to_bqm(from_model(rbm(16, 16, std=2.0)))
+    broken = QpuSampler(Annealer("chimera", [4, 4, 4])).layout(bqm).chains[0][1]
+    annealer = Annealer("chimera", [4, 4, 4], broken_nodes=[broken])
+    sampler = QpuSampler(annealer, faulty="prune")
+    chains, uncoupled = sampler.layout(bqm)
+    assert uncoupled
+    sampler.sample(bqm, num_reads=1, seed=0)
+    unit_of = {qubit: unit for unit, chain in chains.items() for qubit in chain}
+    given = {frozenset(pair): 0.0 for pair in bqm.quadratic}
+    for (one, other), strength in annealer.given[0][0].quadratic.items():
+        if unit_of[one] != unit_of[other]:
+            given[frozenset((unit_of[one], unit_of[other]))] += abs(strength)
+    assert {pair for pair, strength in given.items() if strength == 0} == set(map(frozenset, uncoupled))
+    factors = [given[frozenset(pair)] / abs(strength) for pair, strength in bqm.spin.quadratic.items()]
+    kept = [factor for factor in factors if factor]
+    assert max(kept) == pytest.approx(min(kept))
 
 
 @pytest.mark.parametrize("rule", ["majority", "discard"])

@@ -34,7 +34,7 @@ SOLVERS = {
     "DMM with both": DmmSolver(n_restarts=28, patience=11, max_steps=101, record=Recording(every=7)),
     "DMM with warm restarts": DmmSolver(n_restarts=28, patience=7, max_steps=101, warm=WarmRestart()),
     "DMM with default settings": DmmSolver(),
-    "DMM without descents": DmmSolver(n_restarts=28, max_steps=301, quench_every=0),
+    "DMM without descents": DmmSolver(n_restarts=67, max_steps=1009, quench_every=0),
     "DMM of bonds": DmmSolver(field=BondField(), n_restarts=11, max_steps=101, record=Recording(every=7)),
     "DMM in plain torch": DmmSolver(n_restarts=11, max_steps=101, kernel="reference"),
     "DMM of bonds in plain torch": DmmSolver(

@@ -29,7 +29,7 @@ def walk(memory: Tensor, n_times: int = 300, n_chains: int = 200) -> Tensor:
 
 
 def test_time_of_chains_whose_time_is_known() -> None:
-    series = walk(torch.tensor([0.0, 0.5, 0.8]))
+    series = walk(torch.tensor([0.0, 0.5, 0.8]), n_chains=2000)
     expected = torch.tensor([1.0, 3.0, 9.0], dtype=torch.float64)  # (1 + memory) / (1 - memory)
     time = autocorrelation_time(series)
     assert time.shape == (3,)
