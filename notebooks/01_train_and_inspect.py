@@ -28,12 +28,13 @@ import lightning.pytorch as pl
 import matplotlib.pyplot as plt
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import LogLikelihood, MomentumSchedule, ReconstructionError, SaturationGuard
+from memcomp_lightning.callbacks import LogLikelihood, ReconstructionError, SaturationGuard
 from memcomp_lightning.data import Digits, ImageDataModule
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
+from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.plotting import picture_grid
 from memcomp_lightning.samplers import CD
+from memcomp_lightning.training import Greedy, MomentumSchedule, evaluate
 
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # fewer greetings
 images = Digits().load()
@@ -47,12 +48,12 @@ plt.show()
 # %% [markdown]
 # ## Pretraining
 #
-# `DBNPretraining` is a LightningModule, `CD` the sampler that supplies its negative phase. Any other sampler takes its place; nothing
+# `EnergyPretraining` is a LightningModule, `CD` the sampler that supplies its negative phase. Any other sampler takes its place; nothing
 # else changes. Callbacks log to whatever logger the trainer has.
 
 # %%
 dbn = DBN(32, [32, 32], generator=rng.stream(0, "weights"))
-module = DBNPretraining(dbn, CD(k=1), iterations=20)
+module = EnergyPretraining(Greedy(dbn), CD(k=1), iterations=20, schedules=[MomentumSchedule()])
 data = ImageDataModule(images, batch_size=50, validation_fraction=0.1)
 log = pl.loggers.CSVLogger("logs", name="pretraining")
 
@@ -69,7 +70,7 @@ def trainer(epochs, callbacks=()):
     )
 
 
-looking = [MomentumSchedule(), ReconstructionError(), LogLikelihood(every=5), SaturationGuard()]
+looking = [ReconstructionError(), LogLikelihood(every=5), SaturationGuard()]
 trainer(module.n_epochs, looking).fit(module, datamodule=data)
 
 # %% [markdown]

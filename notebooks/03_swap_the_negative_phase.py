@@ -31,9 +31,9 @@ from memcomp_lightning.data import BarsAndStripes, ImageDataModule
 from memcomp_lightning.likelihood import kl_divergence
 from memcomp_lightning.models import DBN
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.replicas import Rates, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
 from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.training import Greedy, LearningRateDecay, pretrain
 
 N_SEEDS, N_UPDATES = 10, 2000
 images = BarsAndStripes(side=3).load()
@@ -53,7 +53,7 @@ samplers = {
 # %% [markdown]
 # ## Train each of them
 #
-# Ten seeds side by side on the replica axis: one tensor program. `pretrain_layer` is the loop of `DBNPretraining` without the trainer.
+# Ten seeds side by side on the replica axis: one tensor program. `pretrain` is the loop of `EnergyPretraining` without the trainer.
 # `experiment=sampler_worth` does this on six data sets with the best learning rate of each sampler, and with its time.
 
 # %%
@@ -64,10 +64,10 @@ for name, sampler in samplers.items():
     iterations = N_UPDATES // 10 if name == "ground states alone" else N_UPDATES
     dbn = DBN(9, [18], replicas=(N_SEEDS,), generator=rng.stream(0, "weights"))
     optimizer = partial(torch.optim.SGD, lr=learning_rate.get(name, 1.0))
-    rates = Rates(optimizer, learning_rate=lambda done, n=iterations: 1 - 0.99 * done / n)  # falls to a hundredth
+    decay = LearningRateDecay(iterations)  # falls to a hundredth
     batches = data.train_batches(0, 1).repeated([0] * N_SEEDS)
-    training = pretrain_layer(
-        dbn, 0, batches, sampler, iterations=iterations, rates=rates, generator=rng.stream(0, "negative_phase")
+    training = pretrain(
+        Greedy(dbn), batches, sampler, iterations=iterations, optimizer=optimizer, schedules=[decay]
     )
     kl[name], machines[name] = [], {}
     for done in training:

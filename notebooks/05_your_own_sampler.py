@@ -30,9 +30,9 @@ from memcomp_lightning.data import BarsAndStripes, ImageDataModule
 from memcomp_lightning.errors import require
 from memcomp_lightning.likelihood import kl_divergence
 from memcomp_lightning.models import DBN
-from memcomp_lightning.replicas import Rates, pretrain_layer
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.testing import check_sampler
+from memcomp_lightning.training import Greedy, LearningRateDecay, pretrain
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 
@@ -87,12 +87,13 @@ except AssertionError as error:
 images = BarsAndStripes(side=3).load()
 v, n_seeds, n_updates = images.train_v.expand(10, -1, -1), 10, 3000
 data = ImageDataModule(images, batch_size=None)
-rates = Rates(partial(torch.optim.SGD, lr=0.5), learning_rate=lambda done: 1 - 0.99 * done / n_updates)
+optimizer, decay = partial(torch.optim.SGD, lr=0.5), LearningRateDecay(n_updates)  # falls to a hundredth
 for name, sampler in {"CD-1": CD(k=1), "CD-2": CD(k=2), "warm CD": WarmCD(beta=0.5)}.items():
     dbn = DBN(9, [18], replicas=(n_seeds,), generator=rng.stream(0, "weights"))
     batches = data.train_batches(0, 1).repeated([0] * n_seeds)
-    generator = rng.stream(0, "negative_phase")
-    training = pretrain_layer(dbn, 0, batches, sampler, iterations=n_updates, rates=rates, generator=generator)
+    training = pretrain(
+        Greedy(dbn), batches, sampler, iterations=n_updates, optimizer=optimizer, schedules=[decay]
+    )
     course = [
         (done.number, float(kl_divergence(dbn[0], v).median())) for done in training if done.number % 100 == 0
     ]

@@ -12,15 +12,14 @@ from sklearn.datasets import load_digits
 from torch.optim import SGD
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import MomentumSchedule
 from memcomp_lightning.data import Batches, independent_log_likelihood
 from memcomp_lightning.likelihood import log_likelihood, log_partition_function
 from memcomp_lightning.models import DBN, start_at_means
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.replicas import Rates, pretrain
 from memcomp_lightning.samplers import CD, PCD
+from memcomp_lightning.training import Greedy, MomentumSchedule, pretrain
 
-PAPER = MomentumSchedule(0.1, 0.5, switch_at=5).momentum
+PAPER = MomentumSchedule(0.1, 0.5, switch_at=5)
 ROWS = {
     "the paper's: 50 full batches, rate .1, momentum": (50, None, 0.1, PAPER, False, False),
     "the same in batches of 20, 10 passes": (10, 20, 0.1, PAPER, False, False),
@@ -57,8 +56,18 @@ def main() -> None:
                     start_at_means(dbn[0], train)
                 labels = torch.zeros(len(train), dtype=torch.long)
                 batches = Batches(train, labels, batch_size, chunk_size=10_000, shuffle=True, seed=seed)
-                rates, centring = Rates(partial(SGD, lr=rate), momentum), Centring() if centred else None
-                pretrain(dbn, batches, sampler, iterations=passes, rates=rates, centring=centring, seed=seed)
+                training = pretrain(
+                    Greedy(dbn),
+                    batches,
+                    sampler,
+                    iterations=passes,
+                    optimizer=partial(SGD, lr=rate),
+                    schedules=[] if momentum is None else [momentum],
+                    centring=Centring() if centred else None,
+                    seed=seed,
+                )
+                for _ in training:
+                    pass
                 log_z = log_partition_function(dbn[0])
                 found.append(float(log_likelihood(dbn[0], held, log_z).mean()))
             cells.append(f"{statistics.mean(found):.2f} ± {statistics.stdev(found) / len(found) ** 0.5:.2f}")

@@ -29,8 +29,8 @@ from memcomp_lightning.likelihood import (
 from memcomp_lightning.models import DBN, RBM, Gaussian, Initialiser, Xavier
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.replicas import Rates, pretrain_layer
 from memcomp_lightning.samplers import PCD
+from memcomp_lightning.training import Greedy, pretrain
 
 CASES = {"centred": Centring(rate=0.01), "plain": None}
 
@@ -74,15 +74,14 @@ def trained(images: ImageData, given: argparse.Namespace, centring: Centring | N
         shuffle=published.shuffled,
         seed=given.seed,
     )
-    passes = pretrain_layer(
-        dbn,
-        0,
+    passes = pretrain(
+        Greedy(dbn),
         batches,
         PCD(k=1, n_chains=100),
         iterations=given.passes or published.passes,
-        rates=Rates(partial(SGD, lr=given.rate)),
+        optimizer=partial(SGD, lr=given.rate),
         centring=centring,
-        generator=rng.stream(given.seed, "negative_phase"),
+        seed=given.seed,
     )
     begin = time.perf_counter()
     for done in passes:

@@ -25,8 +25,9 @@ from memcomp_lightning import callbacks as ours
 from memcomp_lightning import rng
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD, PCD
+from memcomp_lightning.training import Greedy
 
 N_VISIBLE, BATCH, NEVER = 784, 100, 10**9
 TARGET = 0.03
@@ -77,7 +78,7 @@ def fit(
     images: ImageData, n_hidden: int, sampler: CD | PCD, n_passes: int, callbacks: list[pl.Callback]
 ) -> dict[str, list[float]]:
     """Train; seconds of each action of the profiler, call by call."""
-    module = DBNPretraining(DBN(N_VISIBLE, [n_hidden]), sampler, iterations=n_passes, centring=None)
+    module = EnergyPretraining(Greedy(DBN(N_VISIBLE, [n_hidden])), sampler, iterations=n_passes, centring=None)
     profiler = SimpleProfiler()
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(

@@ -14,13 +14,12 @@ import lightning.pytorch as pl
 import torch
 from torch.optim import SGD
 
-from memcomp_lightning.callbacks import MomentumSchedule
 from memcomp_lightning.data import ImageData, ImageDataModule
 from memcomp_lightning.data.reduce import SIX_BY_SIX_WITHOUT_CORNERS
 from memcomp_lightning.models import DBN, Gaussian
 from memcomp_lightning.modules import DBNClassifier
-from memcomp_lightning.replicas import Rates, finetune
 from memcomp_lightning.rng import stream, uniform
+from memcomp_lightning.training import MomentumSchedule, finetune
 
 N_IMAGES, BATCH_SIZE, N_PARTITIONS = 60_000, 100, 10
 FIGURE_4 = 24_000_000
@@ -36,7 +35,9 @@ def images() -> ImageData:
 
 def classifier(n_replicas: int, iterations: int) -> DBNClassifier:
     dbn = DBN(32, [32, 32], replicas=(n_replicas,), weight_init=Gaussian(std=0.1))
-    return DBNClassifier(dbn, iterations=iterations, optimizer=partial(SGD, lr=0.1))
+    return DBNClassifier(
+        dbn, iterations=iterations, optimizer=partial(SGD, lr=0.1), schedules=[MomentumSchedule()]
+    )
 
 
 def stacked(data: ImageDataModule, n_replicas: int, n_passes: int) -> float:
@@ -44,9 +45,9 @@ def stacked(data: ImageDataModule, n_replicas: int, n_passes: int) -> float:
     module = classifier(n_replicas, n_passes + 1)
     copies = max(1, n_replicas // data.replicas[0])
     batches = data.train_batches(0, 1).repeated([0] * copies)
-    rates = Rates(module.make_optimizer, MomentumSchedule().momentum)
+    settings = {"optimizer": module.make_optimizer, "schedules": module.schedules}
     begin = time.perf_counter()
-    for done in finetune(module.network, batches, iterations=n_passes + 1, rates=rates):
+    for done in finetune(module.network, batches, iterations=n_passes + 1, **settings):
         if done == 1:  # the first pass warms up
             begin = time.perf_counter()
     return (time.perf_counter() - begin) / (n_passes * len(batches) * n_replicas)
@@ -61,7 +62,6 @@ def under_lightning(data: ImageDataModule, n_passes: int) -> float:
         accelerator="cpu",
         logger=False,
         limit_val_batches=0,
-        callbacks=[MomentumSchedule()],
         **quiet,
     )
     begin = time.perf_counter()

@@ -23,17 +23,18 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks import NegativePhaseEnergies, OptimizerMonitor, ReconstructionError
 from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule, PixelLayout
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNClassifier, DBNPretraining
+from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.samplers import CD
+from memcomp_lightning.training import Greedy
 
 N_VISIBLE, N_HIDDEN, BATCH, LEARNING_RATE, MOMENTUM = 784, 500, 100, 0.1, 0.5
 
 
 def lightning_epoch(images: ImageData) -> tuple[float, Tensor]:
-    """One epoch through DBNPretraining, with callbacks and TensorBoard; seconds of training, final weights."""
+    """One epoch through EnergyPretraining, with callbacks and TensorBoard; seconds of training, final weights."""
     dbn = DBN(N_VISIBLE, [N_HIDDEN])
     optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
-    module = DBNPretraining(dbn, CD(k=1), iterations=1, optimizer=optimizer, centring=None)
+    module = EnergyPretraining(Greedy(dbn), CD(k=1), iterations=1, optimizer=optimizer, centring=None)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             max_epochs=1,
@@ -131,7 +132,7 @@ def main() -> None:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     images = random_images(arguments.images)
     candidates: dict[str, Callable[[], float]] = {
-        "DBNPretraining, logging on": lambda: lightning_epoch(images)[0],
+        "EnergyPretraining, logging on": lambda: lightning_epoch(images)[0],
         "hand-written torch loop": lambda: hand_written_epoch(images)[0],
         "scikit-learn BernoulliRBM, float32": lambda: sklearn_epoch(images, "float32"),
         "scikit-learn BernoulliRBM, float64": lambda: sklearn_epoch(images, "float64"),

@@ -7,9 +7,7 @@ from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
 from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
-from memcomp_lightning.callbacks.learning_rate_decay import LearningRateDecay
 from memcomp_lightning.callbacks.log_likelihood import LogLikelihood
-from memcomp_lightning.callbacks.momentum_schedule import MomentumSchedule
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
 from memcomp_lightning.callbacks.pictures import ChainPictures, ModelSamples, ReceptiveFields
@@ -17,6 +15,7 @@ from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.reconstruction import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
 from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
+from memcomp_lightning.callbacks.schedules import Schedules
 from memcomp_lightning.callbacks.stage_times import StageTimes
 from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
@@ -28,10 +27,8 @@ __all__ = [
     "FreeEnergyGap",
     "GradientBias",
     "HyperParameters",
-    "LearningRateDecay",
     "LogLikelihood",
     "ModelSamples",
-    "MomentumSchedule",
     "NegativePhaseEnergies",
     "OptimizerMonitor",
     "ParameterHistograms",
@@ -39,6 +36,7 @@ __all__ = [
     "ReconstructionError",
     "SamplerDiagnostics",
     "SaturationGuard",
+    "Schedules",
     "StageProgressBar",
     "StageTimes",
     "TrajectoryFigure",

@@ -7,14 +7,14 @@ A module that trains an energy model offers both of these:
   the images, if ``positive.v`` is something else; ``validation_step`` returns one with ``v`` of held-out images.
 * Attributes: ``model``, the model in training.
 
-A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.modules.Score`) in the
+A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.training.Score`) in the
 dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
 
 Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
 epoch), ``iterations`` (passes of a stage or layer, default the trainer's ``max_epochs``), ``progress`` (text of
-the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``dbn`` and ``layer`` (the stack that
-``model`` is part of), ``models`` (all that are trained, if ``model`` is one of several), ``sampler`` (tells
-whether chains persist, default yes), ``active_optimizer``.
+the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``models`` and ``layer`` (all that are
+trained, from the lowest up, and which of them ``model`` is, from 0), ``sampler`` (tells whether chains persist,
+default yes), ``active_optimizer``.
 """
 
 from abc import ABC, abstractmethod

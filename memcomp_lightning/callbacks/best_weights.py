@@ -7,22 +7,19 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import required
+from memcomp_lightning.training import BestPass
 
 
 class BestWeights(pl.Callback):
     """Keeps the weights of the pass with the highest accuracy on held-out images, and puts them back at the end.
 
     Works with any module whose ``validation_step`` returns a dictionary with ``score``
-    (:class:`memcomp_lightning.modules.Score`). Replicas keep a pass each: their tensors begin with the axes of the
-    accuracy. Of passes that are equal the first one stays. The state is in checkpoints.
-
-    Attributes:
-        accuracy: The highest so far, ``(*replicas,)``; None before the first pass.
+    (:class:`memcomp_lightning.training.Score`). Replicas keep a pass each: their tensors begin with the axes of
+    the accuracy. Of passes that are equal the first one stays. The state is in checkpoints.
     """
 
     def __init__(self) -> None:
-        self.accuracy: Tensor | None = None
-        self._weights: dict[str, Tensor] = {}
+        self._best = BestPass()
         self._score: Any = None
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -50,23 +47,12 @@ class BestWeights(pl.Callback):
         # Every process must come to the same weights: they judge by the images of all.
         counts = self._score.n_correct.float(), torch.tensor(float(self._score.n_images), device=pl_module.device)
         n_correct, n_images = (trainer.strategy.reduce(count, reduce_op="sum") for count in counts)
-        accuracy = n_correct / n_images
-        better = torch.ones_like(accuracy, dtype=torch.bool)
-        if self.accuracy is not None:
-            better = accuracy > self.accuracy.to(accuracy)
-            accuracy = torch.where(better, accuracy, self.accuracy.to(accuracy))
-        self.accuracy = accuracy
-        for name, now in pl_module.state_dict().items():
-            if not now.is_floating_point():  # indices, which no replica has of its own
-                self._weights[name] = now.clone()
-                continue
-            own = better.view((*better.shape, *[1] * (now.ndim - better.ndim)))
-            self._weights[name] = torch.where(own, now, self._weights.get(name, now).to(now))
+        self._best.offer(n_correct / n_images, pl_module.state_dict())
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Put the best weights back."""
-        if self._weights:
-            pl_module.load_state_dict(self._weights)
+        if self._best.weights:
+            pl_module.load_state_dict(self._best.weights)
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """The same where nothing was left to train, after an interruption at the very end."""
@@ -74,8 +60,13 @@ class BestWeights(pl.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Accuracies and weights."""
-        return {"accuracy": self.accuracy, "weights": self._weights}
+        return {"accuracy": self._best.accuracy, "weights": self._best.weights}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
-        self.accuracy, self._weights = state_dict["accuracy"], state_dict["weights"]
+        self._best.accuracy, self._best.weights = state_dict["accuracy"], state_dict["weights"]
+
+    @property
+    def accuracy(self) -> Tensor | None:
+        """The highest so far, ``(*replicas,)``; None before the first pass."""
+        return self._best.accuracy

@@ -11,7 +11,7 @@ class ClassificationMetrics(pl.Callback):
     """Logs ``loss`` and ``accuracy`` of the pass, ``heldout_`` and ``test_`` likewise: means over replicas.
 
     Works with any module whose ``training_step``, ``validation_step`` and ``test_step`` return a dictionary
-    with ``score`` (:class:`memcomp_lightning.modules.Score`). The values of each replica stay in ``latest``.
+    with ``score`` (:class:`memcomp_lightning.training.Score`). The values of each replica stay in ``latest``.
 
     Attributes:
         latest: The newest score of each kind: "train", "heldout", "test".

@@ -74,11 +74,10 @@ class ReceptiveFields(Pictures):
     def tiles(self, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> Tensor:
         """Weights of the layer in training times those below."""
         fields: Tensor = model_of(pl_module).weight
-        dbn: Any = getattr(pl_module, "dbn", None)
+        models: Any = getattr(pl_module, "models", ())
         layer: Any = getattr(pl_module, "layer", 0)
-        layers_below = range(layer) if dbn is not None else ()
-        for below in reversed(layers_below):
-            fields = fields @ dbn[below].weight
+        for below in reversed(models[:layer]):
+            fields = fields @ below.weight
         return fields
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from memcomp_lightning.callbacks.base import iteration_of, prefix_of
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.modules.stage import DivergedError, diverged_parameter
+from memcomp_lightning.training import DivergedError, diverged_parameter
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import BestWeights, MomentumSchedule, StageProgressBar
+from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
 from memcomp_lightning.cli.errors import UserError, in_words
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.kinds import check_kinds
@@ -25,18 +25,12 @@ from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser, start_at_means
-from memcomp_lightning.modules import (
-    BoltzmannPretraining,
-    Classifier,
-    DBNClassifier,
-    EnergyPretraining,
-    OptimizerFactory,
-    StageModule,
-)
-from memcomp_lightning.modules.trainers import check_callback, precision_of
+from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining, StageModule
+from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
+from memcomp_lightning.training import OptimizerFactory, Schedule
 
 
 @dataclass(frozen=True)
@@ -70,7 +64,7 @@ class Plan:
         return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
 
 
-_STAGE_SETTINGS = ("iterations", "batch_size", "optimizer")
+_STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _GROUPS = (
     "data",
     "model",
@@ -86,8 +80,8 @@ _GROUPS = (
 _SETTINGS = {
     "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
-    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "module"),
-    "finetune": (*_STAGE_SETTINGS, "loss", "units"),
+    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "stage"),
+    "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best"),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
@@ -126,19 +120,20 @@ def build(config: DictConfig) -> Plan:
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
             start_at_means(network[0] if isinstance(network, DBN) else network, data.train[0])
-        make = instantiate(config.pretrain.module)
-        _check_module(make, network)
+        schedules = _schedules(config, "pretrain")
         try:
-            module = make(
-                network,
-                _sampler(config, data),
-                iterations=config.pretrain.iterations,
-                optimizer=_optimizer(config, "pretrain", callbacks),
-                centring=centring,
-                seed=seed,
-            )
+            stage = instantiate(config.pretrain.stage)(network)
         except TypeError as error:
-            raise UserError(f"pretrain.module: {error}") from error
+            raise UserError(f"pretrain.stage: {error}") from error
+        module = EnergyPretraining(
+            stage,
+            _sampler(config, data),
+            iterations=config.pretrain.iterations,
+            optimizer=_optimizer(config, "pretrain", schedules),
+            schedules=schedules,
+            centring=centring,
+            seed=seed,
+        )
         pretraining = Stage(module, data, callbacks)
     if config.finetune.iterations > 0:
         require(
@@ -149,16 +144,20 @@ def build(config: DictConfig) -> Plan:
             "For a deep one that is fine-tuned use model=dbn pretrain=joint.",
         )
         callbacks = _callbacks(config, "finetune")
-        require(
-            config.data.validation_fraction > 0 or not any(isinstance(c, BestWeights) for c in callbacks),
-            "data.validation_fraction",
-            config.data.validation_fraction,
-            "a share above 0 of the training images where callbacks.finetune has BestWeights",
-            "The test images would choose the pass.",
-        )
+        if config.finetune.keep_best:
+            require(
+                config.data.validation_fraction > 0,
+                "data.validation_fraction",
+                config.data.validation_fraction,
+                "a share above 0 of the training images where finetune.keep_best is true",
+                "The test images would choose the pass.",
+            )
+            callbacks.append(BestWeights())
+        schedules = _schedules(config, "finetune")
         settings: dict[str, Any] = {
             "iterations": config.finetune.iterations,
-            "optimizer": _optimizer(config, "finetune", callbacks),
+            "optimizer": _optimizer(config, "finetune", schedules),
+            "schedules": schedules,
             "loss": config.finetune.loss,
             "seed": seed,
         }
@@ -188,6 +187,20 @@ def build(config: DictConfig) -> Plan:
     return plan
 
 
+def check_without_trainer(plan: Plan, config: DictConfig) -> None:
+    """Refuse what changes training and is not there in a loop without a trainer.
+
+    Raises:
+        SettingError: Naming the callback or the setting.
+    """
+    for stage in plan.stages:
+        for callback in stage.callbacks:
+            check_bare_loop(callback, f"callbacks.{stage.module.stage}")
+    max_time = config.trainer.get("max_time")
+    allowed = "null: figures, comparisons and choices train without a trainer"
+    require(max_time is None, "trainer.max_time", max_time, allowed)
+
+
 def _part(settings: Any, name: str) -> Any:
     """What settings with a ``_target_`` stand for; None for null."""
     named = settings is None or (isinstance(settings, DictConfig) and "_target_" in settings)
@@ -195,15 +208,15 @@ def _part(settings: Any, name: str) -> Any:
     return instantiate(settings)
 
 
-def _check_module(make: Any, network: nn.Module) -> None:
-    """Each model has its way of pretraining."""
-    kind = getattr(make, "func", None)
-    of_machines = isinstance(network, BoltzmannMachine)
-    fits = isinstance(kind, type) and issubclass(kind, EnergyPretraining)
-    fits = fits and (kind is BoltzmannPretraining) == of_machines
-    allowed = "pretrain=boltzmann" if of_machines else "pretrain=greedy, centred or joint"
-    name = getattr(kind, "__name__", make)
-    require(fits, "pretrain.module", name, f"one for {type(network).__name__}: {allowed}")
+def _schedules(config: DictConfig, stage: str) -> list[Schedule]:
+    """What changes the optimiser of a stage from pass to pass."""
+    found = []
+    for name, settings in (config[stage].schedules or {}).items():
+        schedule = _part(settings, f"{stage}.schedules.{name}")
+        if schedule is not None:
+            require_parts(f"{stage}.schedules.{name}", schedule, "schedule", ("check", "begin_pass"))
+            found.append(schedule)
+    return found
 
 
 def _network(config: DictConfig, images: ImageData) -> nn.Module:
@@ -263,14 +276,13 @@ def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
         raise UserError(f"{stage}, data: {error}") from error
 
 
-def _optimizer(config: DictConfig, stage: str, callbacks: list[pl.Callback]) -> OptimizerFactory:
+def _optimizer(config: DictConfig, stage: str, schedules: list[Schedule]) -> OptimizerFactory:
     """The optimiser's factory, tried on one parameter so that bad settings show before training."""
     factory: OptimizerFactory = instantiate(config[stage].optimizer)
     try:
         optimizer = factory([nn.Parameter(torch.zeros(1))])
-        for callback in callbacks:
-            if isinstance(callback, MomentumSchedule):
-                callback.check(optimizer)
+        for schedule in schedules:
+            schedule.check(optimizer)
     except (TypeError, ValueError) as error:
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         remedy = f" Leave it out: '~{stage}.optimizer.{unknown[1]}'." if unknown else ""
@@ -284,6 +296,13 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
         kind = type(callback).__name__
         require(isinstance(callback, pl.Callback), f"callbacks.{stage}", kind, "callbacks of Lightning")
         check_callback(callback, f"callbacks.{stage}")
+        require(
+            not isinstance(callback, BestWeights | Schedules),
+            f"callbacks.{stage}",
+            kind,
+            "callbacks that look at training: what changes it belongs to the stage",
+            "Use finetune.keep_best=true." if isinstance(callback, BestWeights) else f"Use {stage}.schedules.",
+        )
     if any(isinstance(callback, ProgressBar) and type(callback) is not StageProgressBar for callback in callbacks):
         # A trainer has one bar: the one that somebody chose takes the place of ours.
         callbacks = [callback for callback in callbacks if type(callback) is not StageProgressBar]

@@ -11,7 +11,7 @@ from hydra import compose
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from memcomp_lightning.cli.build import build, given
+from memcomp_lightning.cli.build import build, check_without_trainer
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
 from memcomp_lightning.cli.overrides import check_entry, check_not_given, search_paths
 from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
@@ -78,13 +78,9 @@ def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
         "claims": figure["claims"],
         "labels": {name: curves[name]["label"] for name in dict.fromkeys((*claimed, *curves))},
         "chosen": {name: own.choose.setting for name, own in composed.items() if tried_values(own)},
-        "stop_early": [name for name, own in composed.items() if _stops_early(own)],
+        "stop_early": [name for name, own in composed.items() if own.finetune.keep_best],
         "scale": ", ".join(part for part in (whole, parts, seeds) if part),
     }
-
-
-def _stops_early(config: DictConfig) -> bool:
-    return any(callback["_target_"].endswith(".BestWeights") for callback in given(config.callbacks.finetune))
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -107,7 +103,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
             chosen = settings.choose.setting
             require(chosen not in _SET_BY_FIGURE, f"choose.setting of figure.curves.{name}", chosen, allowed)
         for own in [for_trial(settings, value) for value in values] or [settings]:
-            build(own)
+            check_without_trainer(build(own), own)
 
 
 def _require_list(name: str, values: Any) -> None:

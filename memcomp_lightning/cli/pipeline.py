@@ -1,10 +1,9 @@
 """The stages of one run, each picked up where it was left."""
 
 import logging
-from typing import Any, cast
+from typing import Any
 
 import lightning.pytorch as pl
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.spike import TrainingSpikeException
@@ -24,18 +23,9 @@ from memcomp_lightning.cli.threads import threads_for
 from memcomp_lightning.cli.trainers import trainer_of
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import (
-    BoltzmannPretraining,
-    Classifier,
-    DBMPretraining,
-    DBNPretraining,
-    EnergyPretraining,
-    NotTrainedError,
-    evaluate,
-    load_weights,
-    save_weights,
-)
+from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
 from memcomp_lightning.modules.weights import check_checkpoint
+from memcomp_lightning.training import evaluate
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +48,7 @@ def run(
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():
-            load_weights(_trained(stage), folder.weights(name))
+            load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
             if stage is plan.pretraining:
                 _between(plan, config)
@@ -68,7 +58,7 @@ def run(
         is_global_zero = trainer.is_global_zero
         records[name] = _record(stage)
         if is_global_zero and not config.trainer.fast_dev_run:
-            save_weights(_trained(stage), folder.weights(name))
+            save_weights(stage.module.network, folder.weights(name))
             folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
             _between(plan, config)
@@ -122,22 +112,12 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
 def _check_trained(stage: Stage, config: DictConfig) -> None:
     """Whatever stopped the stage, each of its models has been trained."""
     passes, module = stage.module.passes, stage.module
-    n_models = len(module.models) if isinstance(module, EnergyPretraining) else 1
+    n_models = len(module.phases) if isinstance(module, EnergyPretraining) else 1
     if not config.trainer.fast_dev_run and (len(passes) < n_models or min(passes) == 0):
         raise UserError(
             f"{module.stage} ended after {' and '.join(map(str, passes))} passes, before all of its "
             f"{n_models} models were trained: its weights are not recorded. Leave out the callback that ended it."
         )
-
-
-def _trained(stage: Stage) -> torch.nn.Module:
-    """What a stage trains: the DBN or machine, or the network with its output layer."""
-    module = stage.module
-    if isinstance(module, DBNPretraining | DBMPretraining):
-        return module.dbn
-    if isinstance(module, BoltzmannPretraining):
-        return module.machine
-    return cast(Classifier, module).network
 
 
 def _record(stage: Stage) -> dict[str, Any]:
@@ -149,7 +129,7 @@ def _record(stage: Stage) -> dict[str, Any]:
     }
     if isinstance(module, EnergyPretraining):
         record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
-        record["trained"] = module.model_names
+        record["trained"] = [phase.name for phase in module.phases]
     for callback in stage.callbacks:
         if isinstance(callback, LogLikelihood) and callback.history:
             record["log_likelihood"] = callback.history

@@ -88,7 +88,7 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
         remedy = "Use trainer.check_val_every_n_epoch, or null for it to count batches over passes."
         require(within or trainer.limit_val_batches == 0, "trainer.val_check_interval", every, allowed, remedy)
         judges = any(isinstance(callback, BestWeights) for callback in stage.callbacks)
-        allowed = "1.0 where callbacks.finetune has BestWeights"
+        allowed = "1.0 where finetune.keep_best is true"
         require(
             not judges or trainer.limit_val_batches == 1.0 or tries(trainer),
             "trainer.limit_val_batches",

@@ -12,12 +12,11 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import LearningRateDecay, MomentumSchedule
-from memcomp_lightning.cli.build import Plan, Stage, build, given
-from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import Classifier, DBMPretraining, DBNPretraining, DivergedError, evaluate
-from memcomp_lightning.replicas import Rates, finetune, pretrain, pretrain_jointly, stacked
+from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.models import DBN, stacked
+from memcomp_lightning.modules import Classifier, EnergyPretraining
 from memcomp_lightning.report import Record
+from memcomp_lightning.training import DivergedError, evaluate, finetune, pretrain
 from memcomp_lightning.types import Batch
 
 Progress = Callable[[str, int], None]
@@ -49,9 +48,6 @@ class Member:
         """What networks must share to be fine-tuned as one program."""
         config = self.config
         shared = {name: config[name] for name in ("data", "finetune", "trainer")}
-        of_rates = (".MomentumSchedule", ".LearningRateDecay")
-        callbacks = given(config["callbacks"]["finetune"])
-        shared["schedules"] = [callback for callback in callbacks if callback["_target_"].endswith(of_rates)]
         shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)
 
@@ -138,8 +134,18 @@ def _fine_tuned(
     images = {name: _side_by_side(*held, n_members, replicas, device) for name, held in tests.items() if held}
     scores: dict[str, list[Tensor]] = {f"{name}_{what}": [] for name in images for what in ("accuracy", "loss")}
     n_updates = len(batches) * n_members * math.prod(replicas)
+    # Where several passes are tested, the best of these is found by the report.
+    keeps_best = members[0].config["finetune"]["keep_best"] and len(unit.passes) == 1
     try:
-        for done in finetune(network, batches, iterations=unit.passes[-1], rates=rates_of(stage), loss=loss):
+        for done in finetune(
+            network,
+            batches,
+            iterations=unit.passes[-1],
+            optimizer=stage.module.make_optimizer,
+            schedules=stage.module.schedules,
+            loss=loss,
+            keep_best_by=images["validation"] if keeps_best else None,
+        ):
             progress(f"{unit.title}, pass {done} of {unit.passes[-1]}", n_updates)
             if done in unit.passes:
                 for name, batch in images.items():
@@ -175,27 +181,22 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
     if plan.pretraining is not None:
         stage = plan.pretraining
         module, batches = stage.module, stage.data.train_batches(0, 1).to(device)
-        assert isinstance(module, DBNPretraining | DBMPretraining)
-        settings: dict[str, Any] = {
-            "iterations": module.iterations,
-            "rates": rates_of(stage),
-            "centring": module.centring,
-            "seed": seed,
-        }
-        if isinstance(module, DBMPretraining):
-            pretrain_jointly(module.dbn, batches, module.sampler, module.positive, **settings)
-        else:
-            pretrain(module.dbn, batches, module.sampler, **settings)
+        assert isinstance(module, EnergyPretraining)
+        passes = pretrain(
+            module.pretraining,
+            batches,
+            module.sampler,
+            iterations=module.iterations,
+            optimizer=module.make_optimizer,
+            schedules=module.schedules,
+            centring=module.centring,
+            seed=seed,
+        )
+        for _ in passes:
+            pass
     if plan.between is not None and isinstance(network, DBN):
         plan.between(network, generator=rng.stream(seed, "between stages"))
     return plan
-
-
-def rates_of(stage: Stage) -> Rates:
-    """Optimiser, momentum and learning rate of a stage."""
-    momentum = [callback.momentum for callback in stage.callbacks if isinstance(callback, MomentumSchedule)]
-    decay = [callback.factor for callback in stage.callbacks if isinstance(callback, LearningRateDecay)]
-    return Rates(stage.module.make_optimizer, *(found[0] if found else None for found in (momentum, decay)))
 
 
 def tuning(plan: Plan) -> Stage:

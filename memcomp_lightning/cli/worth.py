@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.build import build, check_without_trainer
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.overrides import check_entry, check_not_given
@@ -61,7 +61,9 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
     seen: set[tuple[str, str]] = set()
     for job in _jobs(config, overrides, Path(), done=set()):
-        plan = build(OmegaConf.create(job.config))
+        own = OmegaConf.create(job.config)
+        plan = build(own)
+        check_without_trainer(plan, own)
         data, model = module_of(plan)[0].data, model_of(side_by_side([plan]))
         require(data.replicas == (), "data.partitions", data.replicas, "1: replicas are seeds here")
         if (job.data_set, job.method) not in seen:
@@ -130,8 +132,8 @@ class _Schedule(NamedTuple):
 
 def _schedule(composed: DictConfig, passes: int, method: DictConfig) -> _Schedule:
     """Share passes out to layers, so that methods of many layers and of one have about as many updates."""
-    target, layers = composed.pretrain.module["_target_"], len(composed.model.get("hidden_sizes", [0]))
-    if target.endswith(".DBNPretraining"):
+    target, layers = composed.pretrain.stage["_target_"], len(composed.model.get("hidden_sizes", [0]))
+    if target.endswith(".Greedy"):
         each = max(1, passes // layers)
         return _Schedule(each, 0, each * layers)
     greedy = round(passes * method.get("greedy_start", 0.0) / layers)
@@ -141,12 +143,12 @@ def _schedule(composed: DictConfig, passes: int, method: DictConfig) -> _Schedul
 
 def _run_settings(passes: int) -> tuple[str, ...]:
     """No fine-tuning, plain gradient descent at a rate that falls to a hundredth."""
-    decay = "{_target_:memcomp_lightning.callbacks.LearningRateDecay,n_passes:" + str(passes) + "}"
+    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:" + str(passes) + "}"
     return (
         f"pretrain.iterations={passes}",
         "finetune.iterations=0",
-        "callbacks.pretrain.momentum_schedule=null",
-        f"+callbacks.pretrain.learning_rate_decay={decay}",
+        "pretrain.schedules.momentum=null",
+        f"pretrain.schedules.decay={decay}",
     )
 
 

@@ -14,24 +14,17 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.threads import in_one_thread
-from memcomp_lightning.cli.units import Progress, rates_of
+from memcomp_lightning.cli.units import Progress
 from memcomp_lightning.cli.worth_measures import gradient_bias, mean_gradient, measure_of, without_diverged
-from memcomp_lightning.data import Batches
-from memcomp_lightning.errors import SettingError, require
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import (
-    BoltzmannPretraining,
-    DBMPretraining,
-    DBNPretraining,
-    DivergedError,
-    EnergyPretraining,
-    joined,
-)
-from memcomp_lightning.replicas import Pass, pretrain_layer, pretrain_machine, stacked
+from memcomp_lightning.models import DBM, DBN, stacked
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.report.worth import Course, weights_path
 from memcomp_lightning.samplers import positive_phase
+from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass, pretrain
 
 
 @dataclass(frozen=True)
@@ -102,17 +95,14 @@ def module_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
 
 def side_by_side(plans: Sequence[Plan]) -> Any:
     """The networks of plans as one with a replica axis: a DBN, or a Boltzmann machine."""
-    module = module_of(plans[0])[1]
-    if isinstance(module, BoltzmannPretraining) and not isinstance(module, DBMPretraining):
-        return stacked([plan.network for plan in plans], ())
-    return stacked([_dbn(plan) for plan in plans], ())
+    return stacked([plan.network for plan in plans], ())
 
 
 def model_of(network: Any) -> Any:
     """The energy model that a network is: itself, its only RBM, or the DBM of its layers."""
     if not isinstance(network, DBN):
         return network
-    return network[0] if len(network) == 1 else joined(network)
+    return network[0] if len(network) == 1 else DBM.from_dbn(network)
 
 
 def run_job(job: Job, progress: Progress) -> list[Course]:
@@ -136,7 +126,7 @@ def _run_job(job: Job, progress: Progress) -> list[Course]:
     _warm_up(model_of(network), module, next(iter(batches)).v)
     measure, seconds = measure_of(job.measure, stage.data, job.n_reported), 0.0
     begin, reported = time.process_time(), 0
-    training = _training(job, stage, module, network, batches)
+    training = _training(job, module, network, batches)
     course = Course(job.data_set, job.method, job.rate)
     updates_a_pass = sum(batch.closes_step for batch in batches)
     try:
@@ -170,36 +160,23 @@ def _run_job(job: Job, progress: Progress) -> list[Course]:
     return [course]
 
 
-def _training(job: Job, stage: Stage, module: EnergyPretraining, network: Any, batches: Batches) -> Training:
+def _training(job: Job, module: EnergyPretraining, network: Any, batches: Batches) -> Training:
     """Layer by layer, or all units at once."""
-    settings: dict[str, Any] = {"rates": rates_of(stage), "centring": module.centring}
-    if isinstance(module, DBNPretraining):
-        layers = _layer_by_layer(network, batches, module, module.iterations, settings)
-        return Training(layers, lambda: model_of(network))
-    assert isinstance(module, BoltzmannPretraining)
+    settings: dict[str, Any] = {
+        "optimizer": module.make_optimizer,
+        "schedules": module.schedules,
+        "centring": module.centring,
+    }
     done = 0
     if job.greedy_passes:
-        for before in _layer_by_layer(network, batches, module, job.greedy_passes, settings):
+        for before in pretrain(Greedy(network), batches, module.sampler, iterations=job.greedy_passes, **settings):
             done = before.number
-    machine = joined(network) if isinstance(network, DBN) else network
-    passes = pretrain_machine(
-        machine, batches, module.sampler, module.positive, iterations=module.iterations, **settings
+    stage = instantiate(OmegaConf.create(job.config).pretrain.stage)(network)
+    passes = pretrain(stage, batches, module.sampler, iterations=module.iterations, **settings)
+    return Training(
+        (after._replace(number=done + after.number) for after in passes),
+        lambda: stage.phases[0].model if len(stage.phases) == 1 else model_of(network),
     )
-    return Training((after._replace(number=done + after.number) for after in passes), lambda: machine)
-
-
-def _layer_by_layer(
-    dbn: DBN, batches: Batches, module: EnergyPretraining, iterations: int, settings: dict[str, Any]
-) -> Iterator[Pass]:
-    """Passes over all layers, numbered through."""
-    generator, before = rng.stream(0, "negative_phase"), 0
-    for layer in range(len(dbn)):
-        passes = pretrain_layer(
-            dbn, layer, batches, module.sampler, iterations=iterations, generator=generator, **settings
-        )
-        for done in passes:
-            yield done._replace(number=before + done.number)
-        before += iterations
 
 
 def _warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:
@@ -208,10 +185,3 @@ def _warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:
     positive = positive_phase(model, v)
     state = module.sampler.init(model, v.shape[-2], generator=generator)
     mean_gradient(copy.deepcopy(model), module.sampler, state, positive, 1, generator=generator)
-
-
-def _dbn(plan: Plan) -> DBN:
-    network = plan.network
-    require(isinstance(network, DBN), "model", type(network).__name__, "a DBN (model=dbn) or a Boltzmann machine")
-    assert isinstance(network, DBN)
-    return network

@@ -22,9 +22,9 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import RBM, EnergyModel, as_two_layers
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.modules.stage import LARGEST_WEIGHT
-from memcomp_lightning.replicas import Pass
 from memcomp_lightning.samplers import Exact, ModeAssisted, positive_phase
+from memcomp_lightning.training import Pass
+from memcomp_lightning.training.diverged import LARGEST_WEIGHT
 from memcomp_lightning.types import Configurations
 
 FANTASY_SWEEPS = 200

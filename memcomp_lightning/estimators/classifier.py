@@ -39,9 +39,9 @@ from memcomp_lightning.estimators.inputs import Matrix, Scaling, batches_of, hid
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.replicas import Backpropagation, Rates, pretrain, pretrain_jointly, require_finite
-from memcomp_lightning.samplers import GroundState, MeanField
+from memcomp_lightning.samplers import GroundState
 from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.training import ClassifierTraining, Greedy, Joint, pretrain, require_finite
 
 UNLABELLED = -1
 """Label of the samples that have none, where the other labels are numbers."""
@@ -292,19 +292,21 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
             dbn[0].b.copy_(torch.from_numpy(log_odds_of(X, weight)))
         sampler = self._default_sampler() if self.sampler is None else self.sampler
         batches = batches_of(X, label, weight, batch_size=self.pretrain_batch_size, sampler=sampler, seed=seed)
-        settings: dict[str, Any] = {
-            "iterations": self.n_iter_pretrain,
-            "rates": Rates(sgd(self.pretrain_learning_rate)),
-            "centring": Centring(rate=CENTRING_RATE) if self.centred else None,
-            "seed": seed,
-        }
-        if self.pretrain == "joint":
-            pretrain_jointly(dbn, batches, sampler, MeanField(), **settings)
-        else:
-            pretrain(dbn, batches, sampler, **settings)
+        stage = Joint(dbn) if self.pretrain == "joint" else Greedy(dbn)
+        passes = pretrain(
+            stage,
+            batches,
+            sampler,
+            iterations=self.n_iter_pretrain,
+            optimizer=sgd(self.pretrain_learning_rate),
+            centring=Centring(rate=CENTRING_RATE) if self.centred else None,
+            seed=seed,
+        )
+        for _ in passes:
+            pass
         self.network_ = self._with_output(dbn, rng.stream(seed, "output weights"))
         self._seed, self.n_iter_ = seed, 0
-        self._training = Backpropagation(self.network_, rates=Rates(sgd(self.learning_rate, self.momentum)))
+        self._training = ClassifierTraining(self.network_, optimizer=sgd(self.learning_rate, self.momentum))
 
     def _with_output(self, dbn: DBN, generator: torch.Generator) -> torch.nn.Module:
         init = Drawn(self.weight_std, dbn[0].weight.dtype)

@@ -1,6 +1,5 @@
 """The restricted Boltzmann machine as a transformer."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,8 +41,8 @@ from memcomp_lightning.likelihood import (
 from memcomp_lightning.models import RBM
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.replicas import ContrastTraining, Rates, require_finite
-from memcomp_lightning.samplers import PCD, positive_phase
+from memcomp_lightning.samplers import PCD
+from memcomp_lightning.training import Greedy, PhaseTraining, require_finite
 
 MOST_ENUMERATED = 20
 """Units of the smaller layer up to which a log-likelihood is exact."""
@@ -214,13 +213,12 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         self._base = torch.from_numpy(log_odds_of(X, weight)).to(rbm.b)
         rbm.b.data.copy_(self._base)
         self.rbm_, self.n_iter_, self._seed = rbm, 0, seed
-        self._training = ContrastTraining(
-            rbm,
-            partial(positive_phase, rbm),
+        self._training = PhaseTraining(
+            Greedy(dbn).phases[0],
             self._negative_phase(),
-            rates=Rates(sgd(self.learning_rate)),
+            optimizer=sgd(self.learning_rate),
             centring=self._centring(),
-            generator=rng.stream(seed, "negative_phase"),
+            streams=rng.streams(seed, ("negative_phase", "positive_phase")),
         )
         self._gibbs_generator = rng.stream(seed, "gibbs")
 

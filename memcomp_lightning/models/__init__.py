@@ -9,6 +9,7 @@ from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.randomise import GaussianMoments, Randomiser, Shuffled
 from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.models.stack import stacked
 
 __all__ = [
     "DBM",
@@ -35,6 +36,7 @@ __all__ = [
     "hidden_blocks",
     "mean_field",
     "mean_log_odds",
+    "stacked",
     "start_at_means",
     "with_batch_norm_relu",
 ]

@@ -52,6 +52,15 @@ class DBM(BoltzmannMachine):
             generator=generator,
         )
 
+    @classmethod
+    @torch.no_grad()
+    def from_dbn(cls, dbn: DBN) -> "DBM":
+        """The machine with the weights of a DBN, on its device."""
+        machine = cls(dbn.n_visible, [rbm.n_hidden for rbm in dbn], replicas=dbn.replicas)
+        machine.to(dbn[0].b)
+        machine.take(dbn)
+        return machine
+
     def _initial(
         self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
     ) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Generator
 from memcomp_lightning import defaults
 from memcomp_lightning.models import BatchNormReluNetwork, Initialiser
 from memcomp_lightning.modules.classifier import Classifier
-from memcomp_lightning.modules.stage import FINETUNING_SGD, OptimizerFactory
+from memcomp_lightning.training import FINETUNING_SGD, OptimizerFactory, Schedule
 
 
 class BaselineClassifier(Classifier):
@@ -22,6 +22,7 @@ class BaselineClassifier(Classifier):
         replicas: Leading axes of independent networks.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser.
+        schedules: Change the optimiser from pass to pass.
         loss: As for :class:`Classifier`.
         weight_init: Draws all weights.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
@@ -37,6 +38,7 @@ class BaselineClassifier(Classifier):
         replicas: tuple[int, ...] = (),
         iterations: int = defaults.FINETUNING_PASSES,
         optimizer: OptimizerFactory = FINETUNING_SGD,
+        schedules: Sequence[Schedule] = (),
         loss: str = "cross_entropy",
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
@@ -50,4 +52,6 @@ class BaselineClassifier(Classifier):
             weight_init=weight_init,
             generator=generator,
         )
-        super().__init__(network, iterations=iterations, optimizer=optimizer, loss=loss, seed=seed)
+        super().__init__(
+            network, iterations=iterations, optimizer=optimizer, schedules=schedules, loss=loss, seed=seed
+        )

@@ -1,27 +1,40 @@
-"""What the pretraining of any energy model shares: both phases, the contrast, the sampler's state."""
+"""Pretraining under a trainer: the energy models of a stage, one after the other."""
 
 import math
+import re
 import sys
-from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
 from lightning.fabric.utilities import move_data_to_device
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
-from memcomp_lightning.modules.stage import OptimizerFactory, StageModule
+from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.objective import Centring, Offsets, weighted
-from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase, tensors_of, with_tensors
+from memcomp_lightning.samplers import NegativePhaseSampler, tensors_of, with_tensors
 from memcomp_lightning.samplers.base import require_sampler
-from memcomp_lightning.training import EnergyStep, StepState
+from memcomp_lightning.training import (
+    PRETRAINING_SGD,
+    EnergyStep,
+    OptimizerFactory,
+    Phase,
+    PretrainingStage,
+    Schedule,
+    StepState,
+)
+from memcomp_lightning.training.stages.base import check_stage
 from memcomp_lightning.types import Batch, NegativePhase
+
+CENTRED = Centring(rate=defaults.CENTRING_RATE)
 
 
 class EnergyPretraining(StageModule):
@@ -31,31 +44,45 @@ class EnergyPretraining(StageModule):
     afresh with each model, and one that monitors a value of one layer means the same value of each.
 
     Args:
+        pretraining: Way of pretraining, with its network: ``Greedy(dbn)``, ``Joint(dbn)``, ``Boltzmann(machine)``.
         sampler: Supplies the negative phase.
         iterations: Passes over the training set for each model, >= 1.
         optimizer: Builds the optimiser of one model from its parameters.
+        schedules: Change the optimiser from pass to pass, for each model anew.
         centring: Settings of the centred gradient; None follows the plain one.
         seed: Seed of the random streams.
 
+    Raises:
+        SettingError: ``iterations`` out of range, or a model that the sampler cannot handle.
+
     Attributes:
+        network: What is pretrained.
         energy_gaps: For each model begun, mean energy of the data less that of the negative phase, in its newest
             update, ``(*replicas,)``: the contrast.
     """
 
     stage = "pretrain"
+    stream_names = ("negative_phase", "positive_phase")
 
     def __init__(
         self,
+        pretraining: PretrainingStage,
         sampler: NegativePhaseSampler[Any, Any],
         *,
-        iterations: int,
-        optimizer: OptimizerFactory,
-        centring: Centring | None,
-        seed: int,
+        iterations: int = defaults.PASSES,
+        optimizer: OptimizerFactory = PRETRAINING_SGD,
+        schedules: Sequence[Schedule] = (),
+        centring: Centring | None = CENTRED,
+        seed: int = 0,
     ) -> None:
         require_count("pretrain.iterations", iterations)
         require_sampler("sampler", sampler)
-        super().__init__(iterations=iterations, optimizer=optimizer, seed=seed)
+        super().__init__(iterations=iterations, optimizer=optimizer, schedules=schedules, seed=seed)
+        check_stage(pretraining, sampler, seed)
+        self.pretraining = pretraining
+        self.network = pretraining.network
+        known = set(self.network.modules())
+        self.models_beside_network = nn.ModuleList(model for model in self.models if model not in known)
         self.sampler = sampler
         self.centring = centring
         self.energy_gaps: list[Tensor] = []
@@ -65,32 +92,58 @@ class EnergyPretraining(StageModule):
         self._fewest_passes = 0
 
     @property
-    @abstractmethod
-    def models(self) -> Sequence[EnergyModel]:
+    def phases(self) -> Sequence[Phase]:
+        """The trainings of one model each, in order."""
+        return self.pretraining.phases
+
+    @property
+    def models(self) -> list[Any]:
         """All energy models that are trained, in order."""
+        return [phase.model for phase in self.phases]
+
+    @property
+    def phase(self) -> Phase:
+        """The present one."""
+        return self.phases[self.layer]
 
     @property
     def model(self) -> EnergyModel:
         """The one in training."""
-        return self.models[self.layer]
+        return self.phase.model
 
     @property
-    def model_names(self) -> list[str]:
-        """What each of them is called in tables."""
-        return ["jointly"]
+    def log_prefix(self) -> str:
+        """Prefix of tags: stage and phase."""
+        return f"{self.stage}/{self.phase.tag}".rstrip("/")
 
-    @abstractmethod
-    def visible_of(self, batch: Batch) -> Tensor:
-        """What the model in training sees of a batch, ``(*replicas, n, n_visible)``."""
+    @property
+    def progress(self) -> str:
+        """Where the stage is, for people."""
+        which = f"{self.phase.name}/{len(self.phases)} · " if len(self.phases) > 1 else ""
+        return f"{self.stage} · {which}iteration {self.iteration + 1}/{self.iterations}"
 
-    @abstractmethod
-    def infer(self, v: Tensor) -> PositivePhase:
-        """Visible states and the hidden units given them, in the model in training."""
+    @property
+    def active_optimizer(self) -> Optimizer:
+        """The optimiser of the model in training."""
+        return self.trainer.optimizers[self.layer]
+
+    def images_of(self, v: Tensor) -> Tensor:
+        """Images that the visible states of the model in training stand for, for pictures."""
+        return self.phase.images_of(v)
+
+    def configure_optimizers(self) -> list[Optimizer]:
+        """One optimiser a model, so that momentum and adaptive rates start afresh."""
+        return [self.make_optimizer(phase.model.parameters()) for phase in self.phases]
+
+    def parameters_at_rest(self) -> Iterable[Parameter]:
+        """All but those of the model in training."""
+        in_training = set(self.model.parameters())
+        return (parameter for parameter in self.parameters() if parameter not in in_training)
 
     @property
     def n_epochs(self) -> int:
         """Value for the trainer's ``max_epochs``: all models."""
-        return self.iterations * len(self.models)
+        return self.iterations * len(self.phases)
 
     @property
     def layer(self) -> int:
@@ -111,7 +164,7 @@ class EnergyPretraining(StageModule):
     def _next_is_due(self) -> bool:
         """Whether the model begun last has had its passes, and there is another one."""
         n_passes = self.current_epoch - self._begun_at[-1]
-        if len(self._begun_at) == len(self.models) or n_passes <= 0:
+        if len(self._begun_at) == len(self.phases) or n_passes <= 0:
             return False
         stopped = self.current_epoch == self._passes_done and self.trainer.should_stop
         return n_passes >= self.iterations or (stopped and n_passes >= self._fewest_passes)
@@ -145,29 +198,33 @@ class EnergyPretraining(StageModule):
                 callback.wait_count, callback.stopped_epoch = 0, 0
                 callback.best_score = torch.tensor(math.inf if callback.mode == "min" else -math.inf, device="cpu")
                 callback.monitor = self.monitored(callback.monitor)
+        super().on_train_epoch_start()
 
     def on_train_epoch_end(self) -> None:
-        """The stage may end with the last model alone."""
+        """Give the network its weights; the stage may end with the last model alone."""
         super().on_train_epoch_end()
+        self.pretraining.hand_over()
         self._let_stop()
-        planned = (len(self.models) - 1) * self.iterations
-        is_last = len(self._begun_at) == len(self.models)
+        planned = (len(self.phases) - 1) * self.iterations
+        is_last = len(self._begun_at) == len(self.phases)
         if is_last and self._begun_at[-1] < planned and self.iteration + 1 == self.iterations:
             self.trainer.should_stop = True  # the trainer does not know that earlier models had fewer passes
 
     def on_train_end(self) -> None:
-        """Give the trainer its own setting back."""
+        """Give the trainer its own setting back, and the network the weights that a callback chose."""
         super().on_train_end()
+        self.pretraining.hand_over()
         self.trainer.fit_loop.min_epochs = self._fewest_passes
 
     def _let_stop(self) -> None:
         """Tell the trainer from which pass on it may stop."""
-        is_last = len(self._begun_at) == len(self.models)
+        is_last = len(self._begun_at) == len(self.phases)
         self.trainer.fit_loop.min_epochs = self._begun_at[-1] + self._fewest_passes if is_last else sys.maxsize
 
     def monitored(self, name: str) -> str:
         """The name under which a value that somebody monitors is logged for the model in training."""
-        return name
+        tags = "|".join(re.escape(phase.tag) for phase in self.phases)
+        return re.sub(rf"^{self.stage}/({tags})/", f"{self.log_prefix}/", name) if tags else name
 
     @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
@@ -179,8 +236,8 @@ class EnergyPretraining(StageModule):
             look at.
         """
         with torch.no_grad():
-            v = self.visible_of(batch)
-            positive, inferred = self.infer(v)
+            v = self.phase.visible_of(batch.v)
+            positive, inferred = self.phase.positive(v, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
         processes = _OfTrainer(self.trainer, self.device)
         step = EnergyStep(sampler=self.sampler, centring=self.centring, processes=processes)
@@ -204,7 +261,7 @@ class EnergyPretraining(StageModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
         """Return the model's visible states ``v`` of held-out images, for the callbacks."""
-        return {"v": self.visible_of(batch)}
+        return {"v": self.phase.visible_of(batch.v)}
 
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains, the offsets and the energy gaps."""

@@ -1,6 +1,6 @@
 """Fine-tuning: a DBN becomes a classifier."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from torch import Generator, nn
@@ -10,7 +10,7 @@ from memcomp_lightning import defaults
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.models import DBN, Initialiser, Linear, with_batch_norm_relu
 from memcomp_lightning.modules.classifier import Classifier
-from memcomp_lightning.modules.stage import FINETUNING_SGD, OptimizerFactory
+from memcomp_lightning.training import FINETUNING_SGD, OptimizerFactory, Schedule
 
 
 class DBNClassifier(Classifier):
@@ -21,6 +21,7 @@ class DBNClassifier(Classifier):
         n_classes: Size of the output layer, >= 2.
         iterations: Passes over the training set, >= 1.
         optimizer: Builds the optimiser.
+        schedules: Change the optimiser from pass to pass.
         loss: As for :class:`Classifier`.
         units: Hidden units: "sigmoid", or "batch_norm_relu" for batch normalisation and ReLU on the same weights.
         output_init: Draws the weights of the output layer; None is N(0, 0.01^2).
@@ -35,6 +36,7 @@ class DBNClassifier(Classifier):
         n_classes: int = 10,
         iterations: int = defaults.FINETUNING_PASSES,
         optimizer: OptimizerFactory = FINETUNING_SGD,
+        schedules: Sequence[Schedule] = (),
         loss: str = "cross_entropy",
         units: Literal["sigmoid", "batch_norm_relu"] = "sigmoid",
         output_init: Initialiser | None = None,
@@ -48,7 +50,9 @@ class DBNClassifier(Classifier):
         )
         hidden = dbn if units == "sigmoid" else with_batch_norm_relu(dbn).to(dbn[0].weight)
         network = nn.Sequential(hidden, output.to(dbn[0].weight))
-        super().__init__(network, iterations=iterations, optimizer=optimizer, loss=loss, seed=seed)
+        super().__init__(
+            network, iterations=iterations, optimizer=optimizer, schedules=schedules, loss=loss, seed=seed
+        )
         self.dbn = dbn
 
     def parameters_at_rest(self) -> Iterable[Parameter]:

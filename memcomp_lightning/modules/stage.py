@@ -1,8 +1,7 @@
 """What the LightningModules of all stages share: optimiser, random streams, state in checkpoints."""
 
 import time
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
@@ -11,44 +10,16 @@ import torch.distributed
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Generator, Tensor, nn
 from torch.nn import Parameter
-from torch.optim import SGD, Optimizer
+from torch.optim import Optimizer
 
-from memcomp_lightning import defaults, rng
+from memcomp_lightning import rng
 from memcomp_lightning.modules.trainers import check_trainer, tries
-
-OptimizerFactory = Callable[[Iterable[Parameter]], Optimizer]
-"""Builds an optimiser for some parameters: ``functools.partial(torch.optim.SGD, lr=0.1)``."""
-
-LARGEST_WEIGHT = 1e15
-"""A parameter beyond this, or not finite, means that training diverged."""
-
-
-class DivergedError(ValueError):
-    """Training left the finite numbers; which tensor, where, and what to do."""
+from memcomp_lightning.training import DivergedError, OptimizerFactory, Schedule, diverged_parameter
+from memcomp_lightning.training.schedules import begin_pass
 
 
 class NotTrainedError(ValueError):
     """A stage ended, or a pass did, without the optimiser steps that belong to it."""
-
-
-def diverged_parameter(module: nn.Module, largest_allowed: float = LARGEST_WEIGHT) -> str | None:
-    """Say which parameter left the allowed numbers, and how far; None if none did."""
-    for name, parameter in module.named_parameters():
-        if not parameter.numel():  # biases of no hidden units
-            continue
-        largest = float(parameter.detach().abs().max())
-        if not largest <= largest_allowed:
-            return f"{name} has an entry of {largest:g}"
-    return None
-
-
-PRETRAINING_SGD: OptimizerFactory = partial(SGD, lr=defaults.LEARNING_RATE)
-"""What trains energy models unless an optimiser is given."""
-
-FINETUNING_SGD: OptimizerFactory = partial(
-    SGD, lr=defaults.FINETUNING_LEARNING_RATE, momentum=defaults.FINETUNING_MOMENTUM
-)
-"""What trains classifiers unless an optimiser is given."""
 
 
 class StageModule(pl.LightningModule):
@@ -63,18 +34,23 @@ class StageModule(pl.LightningModule):
 
     Attributes:
         stage: Name of the stage; prefix of everything that it logs.
+        network: What is trained.
         iterations: Passes over the training set.
         streams: Named generators of this process, made by :meth:`setup`.
     """
 
     stage: str
+    network: nn.Module
     stream_names: tuple[str, ...] = ("negative_phase",)
 
-    def __init__(self, *, iterations: int, optimizer: OptimizerFactory, seed: int) -> None:
+    def __init__(
+        self, *, iterations: int, optimizer: OptimizerFactory, schedules: Sequence[Schedule], seed: int
+    ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.iterations = iterations
         self.make_optimizer = optimizer
+        self.schedules = schedules
         self.seed = seed
         self.streams: dict[str, Generator] = {}
         self._loaded: list[dict[str, Any]] | None = None
@@ -135,6 +111,10 @@ class StageModule(pl.LightningModule):
         if stage == "fit":
             self._passes_done, self._stop_asked, self._mid_update = 0, False, False
         self.streams = rng.streams(self.seed, self.stream_names, index=self.global_rank)
+
+    def on_train_epoch_start(self) -> None:
+        """Let the schedules set what the pass needs."""
+        begin_pass(self.schedules, self.active_optimizer, self.iteration)
 
     def update(self, loss: Tensor, *, closes_step: bool, optimizer_index: int = 0) -> None:
         """Add the gradient of ``loss``; step and clear once the step's last chunk is in."""
@@ -228,6 +208,9 @@ class StageModule(pl.LightningModule):
             ValueError: The checkpoint was written by another number of processes.
         """
         self._started_at = time.perf_counter()
+        for schedule in self.schedules:
+            for optimizer in self.trainer.optimizers:
+                schedule.check(optimizer)
         if self._loaded is None:
             return
         states, self._loaded = self._loaded, None

@@ -36,6 +36,15 @@ _CALLBACKS: dict[type, tuple[str, str]] = {
         "Use WeightAveraging, or LearningRateDecay for the rate.",
     ),
 }
+_ONLY_LOOK = (
+    callbacks.DeviceStatsMonitor,
+    callbacks.LearningRateMonitor,
+    callbacks.ModelCheckpoint,
+    callbacks.ModelSummary,
+    callbacks.ProgressBar,
+    callbacks.ThroughputMonitor,
+)
+_MAY_END_IT = ("SaturationGuard",)
 _NEED_A_LOGGER = (callbacks.DeviceStatsMonitor, callbacks.LearningRateMonitor, callbacks.ThroughputMonitor)
 
 
@@ -80,6 +89,18 @@ def check_trainer(trainer: pl.Trainer) -> None:
         remedy = "Use logger=csv or logger=tensorboard, or leave the callback out."
         logs = bool(trainer.loggers) or not isinstance(callback, _NEED_A_LOGGER)
         require(logs, "callback", name, "a logger for what it measures", remedy)
+
+
+def check_bare_loop(callback: pl.Callback, where: str) -> None:
+    """Raise unless a callback only looks at training, so that a loop without a trainer may leave it out.
+
+    Raises:
+        SettingError: Naming the callback.
+    """
+    module, name = type(callback).__module__, type(callback).__name__
+    looks = isinstance(callback, _ONLY_LOOK) or module.startswith("memcomp_lightning.callbacks.")
+    allowed = "callbacks that only look at training: figures, comparisons and choices train without a trainer"
+    require(looks and name not in _MAY_END_IT, where, name, allowed, "Leave it out.")
 
 
 def check_callback(callback: pl.Callback, where: str = "callback") -> None:

@@ -1,5 +1,53 @@
-"""What an update of a model is, whatever loop it stands in."""
+"""What an update of a model is, what a stage is made of, and the loops that need no trainer."""
 
+from memcomp_lightning.training.backprop import ClassifierStep
+from memcomp_lightning.training.best import BestPass
+from memcomp_lightning.training.diverged import DivergedError, diverged_parameter, require_finite
+from memcomp_lightning.training.loops import Batches, ClassifierTraining, Pass, PhaseTraining, finetune, pretrain
+from memcomp_lightning.training.losses import LOSSES, Loss, cross_entropy, squared_error
+from memcomp_lightning.training.schedules import (
+    FINETUNING_SGD,
+    PRETRAINING_SGD,
+    LearningRateDecay,
+    MomentumSchedule,
+    OptimizerFactory,
+    Schedule,
+)
+from memcomp_lightning.training.score import Score, evaluate, score
+from memcomp_lightning.training.stages import Boltzmann, Greedy, Joint, Phase, PretrainingStage
 from memcomp_lightning.training.step import EnergyStep, Processes, StepState
 
-__all__ = ["EnergyStep", "Processes", "StepState"]
+__all__ = [
+    "FINETUNING_SGD",
+    "LOSSES",
+    "PRETRAINING_SGD",
+    "Batches",
+    "BestPass",
+    "Boltzmann",
+    "ClassifierStep",
+    "ClassifierTraining",
+    "DivergedError",
+    "EnergyStep",
+    "Greedy",
+    "Joint",
+    "LearningRateDecay",
+    "Loss",
+    "MomentumSchedule",
+    "OptimizerFactory",
+    "Pass",
+    "Phase",
+    "PhaseTraining",
+    "PretrainingStage",
+    "Processes",
+    "Schedule",
+    "Score",
+    "StepState",
+    "cross_entropy",
+    "diverged_parameter",
+    "evaluate",
+    "finetune",
+    "pretrain",
+    "require_finite",
+    "score",
+    "squared_error",
+]

@@ -10,11 +10,20 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear
-from memcomp_lightning.modules import LOSSES, DBNClassifier, cross_entropy, score, squared_error
-from memcomp_lightning.replicas import Rates, finetune, pretrain, stacked
-from memcomp_lightning.replicas.backprop import gradient_of
+from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear, stacked
+from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.samplers import CD, PCD, Exact
+from memcomp_lightning.training import (
+    LOSSES,
+    ClassifierStep,
+    Greedy,
+    MomentumSchedule,
+    cross_entropy,
+    finetune,
+    pretrain,
+    score,
+    squared_error,
+)
 from memcomp_lightning.types import Batch
 
 
@@ -42,11 +51,14 @@ def test_gradient_is_that_of_the_mean_loss(loss, kind, replicas):
         return classifier(replicas, kind)
 
     data, quick, slow = batch(replicas), network(), network()
-    add = gradient_of(quick, loss)
-    assert add.func.__name__ == "_in_closed_form"
-    add(data)
-    add(data)  # chunks add up
+    step = ClassifierStep(quick, loss)
+    assert step._closed_form is not None
+    step.add_gradient(data)
+    value, logits = step.loss(data)
+    value.backward()  # chunks add up, by either way
     (2 * data.share * score(slow(data.v), data.label, loss).mean_loss.sum()).backward()
+    torch.testing.assert_close(value, data.share * score(slow(data.v), data.label, loss).mean_loss.sum())
+    torch.testing.assert_close(logits, slow(data.v), rtol=1e-12, atol=1e-13)
     for (name, p), q in zip(quick.named_parameters(), slow.parameters(), strict=True):
         assert (p.grad is None) == (q.grad is None), name
         if q.grad is not None:
@@ -56,9 +68,13 @@ def test_gradient_is_that_of_the_mean_loss(loss, kind, replicas):
 def test_closed_form_is_taken_where_it_exists():
     closed = [classifier((2,)), classifier((2,), "batch_norm_relu"), BatchNormReluNetwork(7, [5], 11)]
     others = [nn.Identity(), nn.Sequential(Linear(7, 5), Linear(5, 11)), DBN(7, [11]), nn.Sequential()]
-    assert all(gradient_of(network).func.__name__ == "_in_closed_form" for network in closed)
-    assert all(gradient_of(network).func.__name__ == "_by_autograd" for network in others)
-    assert gradient_of(closed[0], lambda logits, label: logits[..., 0]).func.__name__ == "_by_autograd"
+    assert all(ClassifierStep(network)._closed_form is not None for network in closed)
+    assert all(ClassifierStep(network)._closed_form is None for network in others)
+    assert ClassifierStep(closed[0], lambda logits, label: logits[..., 0])._closed_form is None
+    frozen, hooked = classifier((2,), "batch_norm_relu"), classifier((2,))
+    frozen[0].eval()
+    hooked[1].register_forward_hook(lambda *_: None)
+    assert all(ClassifierStep(network)._closed_form is None for network in (frozen, hooked))
 
 
 def test_losses_are_their_formulas():
@@ -73,7 +89,7 @@ def test_losses_are_their_formulas():
 def test_running_statistics_of_batch_normalisation_move_as_in_the_module(n):
     quick, slow = (classifier((2, 3), "batch_norm_relu") for _ in range(2))
     data = batch((2, 3), n)
-    gradient_of(quick)(data)
+    ClassifierStep(quick).add_gradient(data)
     score(slow(data.v), data.label).mean_loss.sum().backward()
     for name, buffer in slow.named_buffers():
         torch.testing.assert_close(quick.get_buffer(name), buffer, rtol=1e-12, atol=1e-13, msg=name)
@@ -105,10 +121,10 @@ def test_no_update_reads_anything_back(sampler):
     for iterations in (2, 7):
         network, data = classifier((2,)), batch((2,))
         batches = Batches(data.v, data.label, batch_size=5, chunk_size=10, shuffle=True, seed=0)
-        rates = Rates(partial(torch.optim.SGD, lr=0.1), momentum=lambda done: 0.5)
+        settings = {"optimizer": partial(torch.optim.SGD, lr=0.1), "schedules": [MomentumSchedule()]}
         with _Reads() as mode:
-            pretrain(network[0], batches, sampler, iterations=iterations, rates=rates)
-            list(finetune(network, batches, iterations=iterations, rates=rates))
+            list(pretrain(Greedy(network[0]), batches, sampler, iterations=iterations, **settings))
+            list(finetune(network, batches, iterations=iterations, **settings))
         reads.append(sorted(mode.found))
     assert reads[0] == reads[1] != []  # what is left is the check at the end
 

@@ -22,15 +22,15 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.modules import DBNClassifier, DBNPretraining, evaluate
+from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.problems import EdgeList, Qubo, WeightedMaxSat, from_model
 from memcomp_lightning.problems.maxsat import Clauses
-from memcomp_lightning.replicas import Rates, finetune, pretrain_layer
 from memcomp_lightning.samplers import CD, PCD, Exact, GroundState, MeanField, Quench, positive_phase
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.testing import small_dbm, small_machine, small_rbm
+from memcomp_lightning.training import Greedy, evaluate, finetune, pretrain
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,10 @@ def test_training_runs_on_the_device(device: str) -> None:
         pytest.skip("Lightning knows no accelerator of this name")
     data = ImageDataModule(Digits().load(), batch_size=100, partitions=2)
     dbn = DBN(32, [7, 5], replicas=(2,))
-    for module in (DBNPretraining(dbn, PCD(n_chains=11), iterations=2), DBNClassifier(dbn, iterations=2)):
+    for module in (
+        EnergyPretraining(Greedy(dbn), PCD(n_chains=11), iterations=2),
+        DBNClassifier(dbn, iterations=2),
+    ):
         trainer = pl.Trainer(
             max_epochs=module.n_epochs,
             accelerator=device,
@@ -156,10 +159,9 @@ def test_the_host_waits_for_no_update(sampler, monkeypatch, device: str) -> None
     batches = data.train_batches(0, 1).to(device)
     order = batches._order()
     monkeypatch.setattr(batches, "_order", lambda: order)
-    rates = Rates(partial(torch.optim.SGD, lr=0.1))
-    generator = rng.stream(0, "negative_phase", device=device)
-    passes = pretrain_layer(dbn, 0, batches, sampler, iterations=2, rates=rates, generator=generator)
-    for training in (passes, finetune(network, batches, iterations=2, rates=rates)):
+    optimizer = partial(torch.optim.SGD, lr=0.1)
+    passes = pretrain(Greedy(dbn), batches, sampler, iterations=2, optimizer=optimizer)
+    for training in (passes, finetune(network, batches, iterations=2, optimizer=optimizer)):
         next(training)  # kernels are loaded
         with _no_waiting(device):
             next(training)

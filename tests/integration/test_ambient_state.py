@@ -21,16 +21,7 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Gaussian
 from memcomp_lightning.models.connectivity import grid
-from memcomp_lightning.modules import (
-    BaselineClassifier,
-    BoltzmannPretraining,
-    Classifier,
-    DBMPretraining,
-    DBNClassifier,
-    DBNPretraining,
-    StageModule,
-    evaluate,
-)
+from memcomp_lightning.modules import BaselineClassifier, Classifier, DBNClassifier, EnergyPretraining, StageModule
 from memcomp_lightning.objective import Centring, contrast
 from memcomp_lightning.problems import from_model
 from memcomp_lightning.samplers import (
@@ -49,6 +40,7 @@ from memcomp_lightning.samplers import (
 )
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
 from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.training import Boltzmann, Greedy, Joint, evaluate
 
 
 @contextlib.contextmanager
@@ -154,11 +146,11 @@ def trained() -> list[torch.Tensor]:
     dbn = DBN(9, [5, 4], weight_init=Gaussian(std=0.5))
     machine = BoltzmannMachine(9, 2, weight_init=Gaussian(std=0.5))
     modules: list[StageModule] = [
-        DBNPretraining(dbn, PCD(n_chains=7), centring=Centring(rate=0.1), **settings),
-        DBMPretraining(dbn, CD(), **settings),
+        EnergyPretraining(Greedy(dbn), PCD(n_chains=7), centring=Centring(rate=0.1), **settings),
+        EnergyPretraining(Joint(dbn), CD(), **settings),
         DBNClassifier(dbn, n_classes=2, **settings),
         DBNClassifier(dbn, n_classes=2, units="batch_norm_relu", **settings),
-        BoltzmannPretraining(machine, CD(), **settings),
+        EnergyPretraining(Boltzmann(machine), CD(), **settings),
         BaselineClassifier(9, [5], n_classes=2, **settings),
         Classifier(BatchNormReluNetwork(9, [5], 2), loss="squared_error", **settings),
     ]

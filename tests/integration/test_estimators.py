@@ -25,7 +25,7 @@ from memcomp_lightning.data import SparseRows
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.estimators import MemcompDBNClassifier, MemcompRBM, inputs
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNClassifier, DBNPretraining
+from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -38,6 +38,7 @@ from memcomp_lightning.samplers import (
     Quench,
 )
 from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.training import Greedy
 
 ROOT = Path(__file__).parents[2]
 SMALL = [
@@ -664,7 +665,7 @@ def test_the_command_line_trains_by_the_same_defaults():
 
 def test_modules_train_by_the_same_defaults():
     parameter = [torch.nn.Parameter(torch.zeros(1))]
-    pretraining = DBNPretraining(DBN(3, [2]), PCD(n_chains=5))
+    pretraining = EnergyPretraining(Greedy(DBN(3, [2])), PCD(n_chains=5))
     assert pretraining.iterations == defaults.PASSES
     assert pretraining.centring.rate == defaults.CENTRING_RATE
     assert pretraining.make_optimizer(parameter).defaults["lr"] == defaults.LEARNING_RATE

@@ -22,9 +22,8 @@ from memcomp_lightning.likelihood import (
 from memcomp_lightning.models import BoltzmannMachine, Gaussian
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.modules import BoltzmannPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.replicas import Rates, pretrain_machine
 from memcomp_lightning.samplers import (
     CD,
     PCD,
@@ -40,6 +39,7 @@ from memcomp_lightning.samplers import (
 )
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce
 from memcomp_lightning.testing import check_sampler
+from memcomp_lightning.training import Boltzmann, pretrain
 
 Run = Callable[..., Outcome]
 
@@ -69,9 +69,9 @@ TINY: dict[str, Callable[..., BoltzmannMachine]] = {
 }
 
 
-def fit(model: BoltzmannMachine, sampler: Any, data: ImageDataModule, **settings: Any) -> BoltzmannPretraining:
+def fit(model: BoltzmannMachine, sampler: Any, data: ImageDataModule, **settings: Any) -> EnergyPretraining:
     optimizer = partial(torch.optim.SGD, lr=0.5)
-    module = BoltzmannPretraining(model, sampler, **{"iterations": 3, "optimizer": optimizer, **settings})
+    module = EnergyPretraining(Boltzmann(model), sampler, **{"iterations": 3, "optimizer": optimizer, **settings})
     trainer = pl.Trainer(
         max_epochs=module.n_epochs,
         accelerator="cpu",
@@ -113,8 +113,8 @@ def test_every_positive_phase_of_no_hidden_units_is_the_data(positive: Any) -> N
 def test_learns_the_maximum_of_the_likelihood() -> None:
     """There pairs of units are on together as often as in the data (Ackley, Hinton & Sejnowski 1985)."""
     model, data = BoltzmannMachine(9, 0), bars()
-    rates = Rates(partial(torch.optim.Adam, lr=0.1))
-    for _ in pretrain_machine(model, data.train_batches(0, 1), Exact(), MeanField(), iterations=300, rates=rates):
+    optimizer = partial(torch.optim.Adam, lr=0.1)
+    for _ in pretrain(Boltzmann(model), data.train_batches(0, 1), Exact(), iterations=300, optimizer=optimizer):
         pass
     v = data.images.train_v
     states = binary_states(9, like=v)

@@ -18,7 +18,7 @@ from memcomp_lightning.data import BarsAndStripes, ImageDataModule, ShiftingBars
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian
-from memcomp_lightning.modules import BoltzmannPretraining, DBMPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.report.worth import Courses, weights_path
 from memcomp_lightning.samplers import (
@@ -31,6 +31,7 @@ from memcomp_lightning.samplers import (
     ModeSchedule,
 )
 from memcomp_lightning.solvers import BruteForce
+from memcomp_lightning.training import Boltzmann, Joint
 
 Run = Callable[..., Outcome]
 
@@ -60,10 +61,9 @@ def test_exact_phases_learn_the_data(kind: str, centring: Centring | None) -> No
     """Bars and stripes, from the uniform distribution (3.6 nats) to close to the data."""
     settings: dict[str, Any] = {"weight_init": Gaussian(std=0.1)}
     model = DBM(9, [5, 3], **settings) if kind == "DBM" else BoltzmannMachine(9, 4, **settings)
-    module = BoltzmannPretraining(
-        model,
+    module = EnergyPretraining(
+        Boltzmann(model, positive=ExactPosterior()),
         Exact(),
-        positive=ExactPosterior(),
         iterations={"DBM": 400, "full": 150}[kind],
         optimizer=partial(torch.optim.SGD, lr=1.0, momentum=0.5),
         centring=centring,
@@ -76,13 +76,13 @@ def test_exact_phases_learn_the_data(kind: str, centring: Centring | None) -> No
 
 def test_a_dbn_takes_the_weights_of_its_dbm() -> None:
     dbn = DBN(9, [5, 3])
-    module = DBMPretraining(dbn, PCD(n_chains=11), iterations=3)
+    module = EnergyPretraining(Joint(dbn), PCD(n_chains=11), iterations=3)
     start = [rbm.weight.clone() for rbm in dbn]
     fit(module, [])
     for rbm, weight, old in zip(dbn, module.model.weights(), start, strict=True):
         torch.testing.assert_close(rbm.weight, weight)
         assert not rbm.weight.equal(old)
-    again = DBMPretraining(dbn, PCD(n_chains=11)).model
+    again = EnergyPretraining(Joint(dbn), PCD(n_chains=11)).model
     torch.testing.assert_close(again.state_dict(), module.model.state_dict())
 
 
@@ -94,8 +94,8 @@ MODE = ModeAssisted(
 @pytest.mark.filterwarnings("ignore:Be aware that when using `ckpt_path`")
 @pytest.mark.parametrize("sampler", [PCD(n_chains=7), MODE], ids=["PCD", "mode-assisted PCD"])
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, sampler: Any) -> None:
-    def module(iterations: int) -> DBMPretraining:
-        return DBMPretraining(DBN(9, [5, 3]), sampler, positive=ClampedGibbs(k=2), iterations=iterations)
+    def module(iterations: int) -> EnergyPretraining:
+        return EnergyPretraining(Joint(DBN(9, [5, 3]), positive=ClampedGibbs(k=2)), sampler, iterations=iterations)
 
     whole, half, rest = module(6), module(6), module(6)
     fit(whole, [])
@@ -111,7 +111,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path, sampler: Any) ->
 def test_callbacks_look_at_boltzmann_machines(tmp_path: Path) -> None:
     found = {}
     for callbacks in ([], [GradientBias(), LogLikelihood(every=1, method="exact", max_units=9)]):
-        module = DBMPretraining(DBN(9, [5, 3]), Exact(), positive=ExactPosterior(), iterations=2)
+        module = EnergyPretraining(Joint(DBN(9, [5, 3]), positive=ExactPosterior()), Exact(), iterations=2)
         trainer = fit(module, list(callbacks))
         found[len(callbacks)] = module.model.state_dict()
     metrics = trainer.callback_metrics
@@ -151,7 +151,7 @@ def test_joint_and_greedy_from_the_command_line(memcomp_train: Run) -> None:
     [
         ("positive.max_iterations=0", "max_iterations = 0"),
         ("positive.tolerance=-1", "tolerance = -1"),
-        ("+pretrain.module.posterior=1", "posterior"),
+        ("+pretrain.stage.posterior=1", "posterior"),
         ("sampler.n_chains=0", "n_chains = 0"),
         ("sampler=exact", "units to enumerate = 32"),
     ],
@@ -185,8 +185,11 @@ def test_a_machine_on_the_graph_of_an_annealer_is_trained_and_resumed(memcomp_tr
     ("overrides", "message"),
     [
         (["model=boltzmann", "pretrain=boltzmann"], "0 for a Boltzmann machine"),
-        (["model=boltzmann", "finetune.iterations=0"], "one for BoltzmannMachine: pretrain=boltzmann"),
-        (["pretrain=boltzmann"], "one for DBN: pretrain=greedy, centred or joint"),
+        (
+            ["model=boltzmann", "finetune.iterations=0"],
+            "For a Boltzmann machine use pretrain=boltzmann",
+        ),
+        (["pretrain=boltzmann"], "For a DBN use pretrain=greedy, centred or joint"),
         (
             ["model=zephyr", "pretrain=boltzmann", "finetune.iterations=0", "model.connectivity.kind=zefyr"],
             "kind = 'zefyr'",

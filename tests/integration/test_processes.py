@@ -49,13 +49,14 @@ import lightning.pytorch as pl, torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from memcomp_lightning.data import Digits, ImageDataModule
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
+from memcomp_lightning.training import Greedy
 from memcomp_lightning.samplers import PCD
 from memcomp_lightning import rng
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 def fit(epochs, resume=None):
-    module = DBNPretraining(DBN(32, [5]), PCD(n_chains=7), iterations=4)
+    module = EnergyPretraining(Greedy(DBN(32, [5])), PCD(n_chains=7), iterations=4)
     keep = ModelCheckpoint("ckpt", filename=f"to{epochs}", save_on_train_epoch_end=True)
     trainer = pl.Trainer(max_epochs=epochs, devices=2, strategy="ddp", accelerator="cpu", logger=False,
                          callbacks=[keep], enable_progress_bar=False, enable_model_summary=False)
@@ -75,7 +76,7 @@ class OwnAnswer:
         return NegativePhase(Configurations(v, model.hidden_mean(v).detach()), state, {})
 
 def fit_shared():
-    module = DBNPretraining(DBN(32, [5]), OwnAnswer(), iterations=3)
+    module = EnergyPretraining(Greedy(DBN(32, [5])), OwnAnswer(), iterations=3)
     trainer = pl.Trainer(max_epochs=3, devices=2, strategy="ddp", accelerator="cpu", logger=False,
                          enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)
     trainer.fit(module, datamodule=ImageDataModule(Digits().load(), batch_size=None, chunk_size=300))

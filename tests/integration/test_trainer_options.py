@@ -18,9 +18,10 @@ from memcomp_lightning.callbacks import ReconstructionError
 from memcomp_lightning.data import ImageDataModule, ShiftingBars
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, Linear
-from memcomp_lightning.modules import Classifier, DBNPretraining, NotTrainedError, StageModule
+from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, StageModule
 from memcomp_lightning.modules.trainers import check_callback
 from memcomp_lightning.samplers import CD, PCD
+from memcomp_lightning.training import Greedy
 
 Run = Callable[..., Outcome]
 WHOLE = ["pretrain.batch_size=null", "finetune.batch_size=null"]
@@ -213,8 +214,8 @@ def trained(module: StageModule, *added: pl.Callback, data: ImageDataModule | No
     return module
 
 
-def pretraining(iterations: int = 2, **settings: Any) -> DBNPretraining:
-    return DBNPretraining(DBN(9, [5, 3]), PCD(n_chains=7), iterations=iterations, **settings)
+def pretraining(iterations: int = 2, **settings: Any) -> EnergyPretraining:
+    return EnergyPretraining(Greedy(DBN(9, [5, 3])), PCD(n_chains=7), iterations=iterations, **settings)
 
 
 def test_every_callback_of_lightning_is_known() -> None:
@@ -415,7 +416,7 @@ def test_a_pass_that_leaves_an_update_half_done_is_an_error() -> None:
 
     data = Partial(ShiftingBars().load(), batch_size=None, chunk_size=2)
     with pytest.raises(NotTrainedError, match="in the middle of an update"):
-        trained(DBNPretraining(DBN(9, [5]), CD(), iterations=2), data=data)
+        trained(EnergyPretraining(Greedy(DBN(9, [5])), CD(), iterations=2), data=data)
 
 
 def test_a_short_try_is_no_stage(memcomp_train: Run) -> None:

@@ -10,11 +10,11 @@ import torch
 from running import FAST, Outcome
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import MomentumSchedule
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, ShiftingBars
 from memcomp_lightning.models import DBN, Gaussian
-from memcomp_lightning.modules import BaselineClassifier, DBNClassifier, DBNPretraining, StageModule, evaluate
+from memcomp_lightning.modules import BaselineClassifier, DBNClassifier, EnergyPretraining, StageModule
 from memcomp_lightning.samplers import CD, PCD, Exact
+from memcomp_lightning.training import Greedy, MomentumSchedule, evaluate
 
 Run = Callable[..., Outcome]
 
@@ -54,8 +54,10 @@ def trained_dbn(
     sampler: Any = None, *, chunk_size: int = 10_000, batch_size: int | None = None, **settings: Any
 ) -> DBN:
     dbn = DBN(7, [5, 3], weight_init=Gaussian(std=0.5))
-    module = DBNPretraining(dbn, sampler or Exact(), iterations=4, centring=None)
-    fit(module, ImageDataModule(images(), batch_size=None, chunk_size=chunk_size), MomentumSchedule())
+    module = EnergyPretraining(
+        Greedy(dbn), sampler or Exact(), iterations=4, centring=None, schedules=[MomentumSchedule()]
+    )
+    fit(module, ImageDataModule(images(), batch_size=None, chunk_size=chunk_size))
     return dbn
 
 
@@ -93,7 +95,7 @@ def test_one_negative_phase_an_update_unless_it_starts_at_the_data(sampler: Any,
 def test_pretraining_one_layer_leaves_the_others_alone() -> None:
     dbn = DBN(7, [5, 3], weight_init=Gaussian(std=0.5))
     before = [parameter.detach().clone() for parameter in dbn.parameters()]
-    module = DBNPretraining(dbn, Exact(), iterations=4)
+    module = EnergyPretraining(Greedy(dbn), Exact(), iterations=4)
     fit(module, ImageDataModule(images(), batch_size=None), max_epochs=4)
     changed = [not a.equal(b) for a, b in zip(before, dbn.parameters(), strict=True)]
     assert changed == [True, True, True, False, False, False]
@@ -104,7 +106,9 @@ def test_exact_pretraining_raises_the_likelihood_of_shifting_bars() -> None:
     dbn = DBN(9, [5], weight_init=Gaussian(std=0.1))
 
     before = mean_log_likelihood(dbn, data)
-    fit(DBNPretraining(dbn, Exact(), iterations=300, optimizer=partial(torch.optim.Adam, lr=0.05)), data)
+    fit(
+        EnergyPretraining(Greedy(dbn), Exact(), iterations=300, optimizer=partial(torch.optim.Adam, lr=0.05)), data
+    )
     after = mean_log_likelihood(dbn, data)
     assert before < -6.0, "nearly uniform over 2^9 states"
     assert after > -3.0, "nearly uniform over the nine bars: log 9 = 2.2"
@@ -117,7 +121,7 @@ def test_any_optimizer_raises_the_likelihood(optimizer: type[torch.optim.Optimiz
     data = ImageDataModule(ShiftingBars().load(), batch_size=None)
     dbn = DBN(9, [5], weight_init=Gaussian(std=0.1))
     before = mean_log_likelihood(dbn, data)
-    fit(DBNPretraining(dbn, Exact(), iterations=50, optimizer=partial(optimizer, lr=0.1)), data)
+    fit(EnergyPretraining(Greedy(dbn), Exact(), iterations=50, optimizer=partial(optimizer, lr=0.1)), data)
     assert mean_log_likelihood(dbn, data) > before + 0.1
 
 
@@ -129,15 +133,18 @@ def test_momentum_switches_within_each_layer() -> None:
             momentum = pl_module.active_optimizer.param_groups[0]["momentum"]
             seen.append((pl_module.layer, pl_module.iteration, momentum))
 
-    module = DBNPretraining(DBN(7, [5, 3]), Exact(), iterations=4)
-    fit(module, ImageDataModule(images(), batch_size=None), MomentumSchedule(0.1, 0.5, switch_at=3), Watch())
+    module = EnergyPretraining(
+        Greedy(DBN(7, [5, 3])), Exact(), iterations=4, schedules=[MomentumSchedule(0.1, 0.5, switch_at=3)]
+    )
+    fit(module, ImageDataModule(images(), batch_size=None), Watch())
     assert seen == [(layer, i, 0.1 if i < 3 else 0.5) for layer in (0, 1) for i in range(4)]
 
 
 def test_momentum_schedule_refuses_an_optimizer_without_momentum() -> None:
-    module = DBNPretraining(DBN(7, [5]), Exact(), iterations=1, optimizer=torch.optim.Adam)
-    with pytest.raises(ValueError, match=r"optimizer = 'Adam'.*momentum_schedule=null"):
-        fit(module, ImageDataModule(images(), batch_size=None), MomentumSchedule())
+    settings = {"optimizer": torch.optim.Adam, "schedules": [MomentumSchedule()]}
+    module = EnergyPretraining(Greedy(DBN(7, [5])), Exact(), iterations=1, **settings)
+    with pytest.raises(ValueError, match=r"optimizer = 'Adam'.*schedules.momentum=null"):
+        fit(module, ImageDataModule(images(), batch_size=None))
 
 
 @pytest.mark.parametrize("kind", ["dbn", "baseline"])
@@ -173,7 +180,7 @@ def test_replicas_learn_as_they_would_alone() -> None:
     both = DBN(7, [5], replicas=(2,), weight_init=Gaussian(std=0.5))
     alone = DBN(7, [5])
     alone.load_state_dict({name: tensor[1] for name, tensor in both.state_dict().items()})
-    fit(DBNPretraining(both, Exact(), iterations=3), data)
+    fit(EnergyPretraining(Greedy(both), Exact(), iterations=3), data)
     batch = next(iter(data.train_dataloader()))
     part = ImageData(
         train_v=batch.v[1],
@@ -184,7 +191,7 @@ def test_replicas_learn_as_they_would_alone() -> None:
         layout=PixelLayout(1, 7),
         name="one part",
     )
-    fit(DBNPretraining(alone, Exact(), iterations=3), ImageDataModule(part, batch_size=None))
+    fit(EnergyPretraining(Greedy(alone), Exact(), iterations=3), ImageDataModule(part, batch_size=None))
     for name, tensor in alone.state_dict().items():
         torch.testing.assert_close(both.state_dict()[name][1], tensor, rtol=1e-5, atol=1e-6)
 

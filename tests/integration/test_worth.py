@@ -93,7 +93,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     settings = [setting for setting in SMALL if not setting.startswith(only)]
     methods = f"{only[0]}[exact]"
     assert memcomp_train(*settings, methods, "worth.claimed=[exact]", "worth.baselines=[]").status == 0
-    decay = "{_target_:memcomp_lightning.callbacks.LearningRateDecay,n_passes:40}"
+    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:40}"
     single = memcomp_train(
         "preset=paper",
         "data=shifting_bars",
@@ -102,8 +102,8 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         "pretrain.iterations=40",
         "pretrain.optimizer.lr=0.5",
         "finetune.iterations=0",
-        "callbacks.pretrain.momentum_schedule=null",
-        f"+callbacks.pretrain.learning_rate_decay={decay}",
+        "pretrain.schedules.momentum=null",
+        f"pretrain.schedules.decay={decay}",
         "seed=3",
         "hydra.run.dir=single",
     )

@@ -10,7 +10,7 @@ from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers import (
     CD,
@@ -25,6 +25,7 @@ from memcomp_lightning.samplers import (
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
+from memcomp_lightning.training import Greedy
 from memcomp_lightning.types import Configurations, NegativePhase
 
 SOLVERS = {
@@ -234,7 +235,7 @@ def test_kit_refuses_what_is_no_sampler_and_states_that_no_checkpoint_keeps():
     with pytest.raises(SettingError, match="state of the sampler = 'dict' is not allowed: expected a NamedTuple"):
         check_sampler(Forgetful())
     with pytest.raises(SettingError, match="state of the sampler = 'dict'"):
-        DBNPretraining(DBN(4, [3]), Forgetful())
+        EnergyPretraining(Greedy(DBN(4, [3])), Forgetful())
 
 
 # --- broken solvers ---------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from memcomp_lightning.cli import figures, pipeline, sweep, trajectory, worth
 from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
-from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.build import build, check_without_trainer
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.errors import UserError, explain, in_words, refuse
@@ -29,7 +29,8 @@ from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.cli.table import closing_lines, run_table, short_path
 from memcomp_lightning.cli.trainers import check_trainers
 from memcomp_lightning.errors import SettingError, require, require_count
-from memcomp_lightning.modules import CheckpointError, DivergedError
+from memcomp_lightning.modules import CheckpointError
+from memcomp_lightning.training import DivergedError
 
 COMMAND = "memcomp-train"
 
@@ -85,6 +86,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     require_count("finetune.iterations", n_passes, minimum=0)
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
+    if values:
+        check_without_trainer(plans[0], config)
     check_trainers(plans[0], config)
 
 

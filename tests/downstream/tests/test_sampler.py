@@ -7,7 +7,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Digits, ImageDataModule
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.testing import (
     check_sampler,
@@ -16,6 +16,7 @@ from memcomp_lightning.testing import (
     state_counts,
     visible_probabilities,
 )
+from memcomp_lightning.training import Greedy
 
 
 def test_conformance() -> None:
@@ -47,7 +48,7 @@ def test_distribution() -> None:
 
 def test_it_trains_a_dbn() -> None:
     dbn = DBN(32, [11, 7])
-    module = DBNPretraining(dbn, RandomScan(), iterations=3)
+    module = EnergyPretraining(Greedy(dbn), RandomScan(), iterations=3)
     before = [parameter.detach().clone() for parameter in dbn.parameters()]
     trainer = pl.Trainer(max_epochs=module.n_epochs, logger=False, enable_checkpointing=False)
     trainer.fit(module, datamodule=ImageDataModule(Digits().load(), batch_size=None))

@@ -13,9 +13,9 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks import StageProgressBar
 from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.models import RBM, Gaussian
-from memcomp_lightning.modules import Score
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, PCD, positive_phase
+from memcomp_lightning.training import Score
 
 PREFIX = "TheirRBM"
 IMAGES = rng.uniform((17, 6), generator=rng.stream(0, "data"))

@@ -10,7 +10,7 @@ import torch
 from torch.utils.data import DataLoader, TensorDataset
 
 from memcomp_lightning.callbacks import BestWeights
-from memcomp_lightning.modules import Score
+from memcomp_lightning.training import Score
 
 N_CORRECT = torch.tensor([[3, 5], [7, 2], [7, 8], [1, 8]])
 """Of ten held-out images, by pass and replica."""

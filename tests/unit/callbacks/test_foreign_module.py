@@ -17,7 +17,6 @@ from memcomp_lightning.callbacks import (
     GradientBias,
     HyperParameters,
     ModelSamples,
-    MomentumSchedule,
     NegativePhaseEnergies,
     OptimizerMonitor,
     ParameterHistograms,
@@ -25,11 +24,13 @@ from memcomp_lightning.callbacks import (
     ReconstructionError,
     SamplerDiagnostics,
     SaturationGuard,
+    Schedules,
     StageProgressBar,
     StageTimes,
     TrajectoryFigure,
 )
 from memcomp_lightning.callbacks.base import model_of
+from memcomp_lightning.training import MomentumSchedule
 
 
 def all_callbacks() -> list[pl.Callback]:
@@ -131,7 +132,7 @@ def test_callbacks_change_no_bit_of_training(tmp_path: Path, kind: type[TheirRBM
 
 
 def test_momentum_schedule_counts_epochs_of_a_foreign_module(tmp_path: Path) -> None:
-    _, trainer = fit(tmp_path, [MomentumSchedule(0.1, 0.7, switch_at=2)], False)
+    _, trainer = fit(tmp_path, [Schedules(MomentumSchedule(0.1, 0.7, switch_at=2))], False)
     assert trainer.optimizers[0].param_groups[0]["momentum"] == 0.7
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from foreign import TheirData, TheirRBM
 
-from memcomp_lightning.callbacks import LearningRateDecay
+from memcomp_lightning.callbacks import Schedules
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.replicas import Rates
+from memcomp_lightning.training import LearningRateDecay
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),
@@ -31,7 +31,7 @@ def rates_of(folder: Path, n_passes: int, resume_from: Path | None = None) -> li
         max_epochs=n_passes,
         accelerator="cpu",
         logger=False,
-        callbacks=[LearningRateDecay(4, final=0.1), seen],
+        callbacks=[Schedules(LearningRateDecay(4, final=0.1)), seen],
         enable_checkpointing=False,
         enable_model_summary=False,
         enable_progress_bar=False,
@@ -53,10 +53,10 @@ def test_rate_falls_linearly_and_goes_on_after_a_resume(tmp_path: Path) -> None:
 
 def test_the_loop_without_a_trainer_does_the_same() -> None:
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=0.1)
-    rates = Rates(torch.optim.SGD, None, LearningRateDecay(4, final=0.1).factor)
+    schedule = LearningRateDecay(4, final=0.1)
     found = []
     for iteration in range(5):
-        rates.begin_pass(optimizer, iteration)
+        schedule.begin_pass(optimizer, iteration)
         found.append(optimizer.param_groups[0]["lr"])
     assert found == pytest.approx([0.1, 0.07, 0.04, 0.01, 0.01])
 

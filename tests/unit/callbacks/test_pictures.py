@@ -8,8 +8,9 @@ from foreign import PREFIX, TheirRBM, events_in, fit, tensorboard
 
 from memcomp_lightning.callbacks import ChainPictures, ModelSamples
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD
+from memcomp_lightning.training import Greedy
 from memcomp_lightning.types import Configurations
 
 
@@ -33,10 +34,10 @@ def test_chains_are_the_negative_phase_the_heaviest_first() -> None:
 
 
 def test_chains_of_an_upper_layer_are_projected_to_the_inputs() -> None:
-    class SecondLayer(DBNPretraining):
+    class SecondLayer(EnergyPretraining):
         layer = 1
 
-    module = SecondLayer(DBN(6, [4, 3]), CD(), iterations=1)
+    module = SecondLayer(Greedy(DBN(6, [4, 3])), CD(), iterations=1)
     v = torch.eye(4)[:2]
     tiles = ChainPictures().tiles(module, {"negative": Configurations(v, torch.zeros(2, 3))})
-    assert tiles.equal(module.dbn[0].visible_mean(v).detach())
+    assert tiles.equal(module.network[0].visible_mean(v).detach())

@@ -15,8 +15,9 @@ from memcomp_lightning.callbacks import SaturationGuard
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining, DivergedError
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD
+from memcomp_lightning.training import DivergedError, Greedy
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),
@@ -101,7 +102,9 @@ def test_weights_go_beside_the_checkpoints_and_no_bad_checkpoint_is_written(tmp_
 def test_a_module_that_stops_itself_leaves_its_good_weights_too(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    module = DBNPretraining(DBN(4, [3]), CD(), iterations=5, optimizer=partial(torch.optim.SGD, lr=1e38), seed=0)
+    module = EnergyPretraining(
+        Greedy(DBN(4, [3])), CD(), iterations=5, optimizer=partial(torch.optim.SGD, lr=1e38), seed=0
+    )
     initial = {name: tensor.clone() for name, tensor in module.state_dict().items()}
     trainer = pl.Trainer(
         max_epochs=5,

@@ -12,8 +12,9 @@ from lightning.pytorch.loggers import CSVLogger
 
 from memcomp_lightning.callbacks import StageTimes, stage_times
 from memcomp_lightning.models import DBN
-from memcomp_lightning.modules import DBNPretraining
+from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD
+from memcomp_lightning.training import Greedy
 from memcomp_lightning.types import Batch
 
 pytestmark = [
@@ -88,7 +89,7 @@ def test_a_resumed_run_adds_up(tmp_path: Path, clock: Clock) -> None:
 
 
 def test_layers_have_times_of_their_own(tmp_path: Path, clock: Clock) -> None:
-    class SlowLayers(DBNPretraining):
+    class SlowLayers(EnergyPretraining):
         def training_step(self, batch: Any, batch_idx: int) -> dict[str, Any]:
             clock.now += self.layer + 1
             images = batch[0]
@@ -102,7 +103,7 @@ def test_layers_have_times_of_their_own(tmp_path: Path, clock: Clock) -> None:
             clock.now += 5
 
     times = StageTimes()
-    fit(tmp_path, [times, Saves()], module=SlowLayers(DBN(6, [4, 3]), CD(), iterations=1), n_passes=2)
+    fit(tmp_path, [times, Saves()], module=SlowLayers(Greedy(DBN(6, [4, 3])), CD(), iterations=1), n_passes=2)
     assert times.summary == {
         "pretrain/layer1": {"training_s": 4.0, "validation_s": 0.0, "other_s": 5.0},
         "pretrain/layer2": {"training_s": 8.0, "validation_s": 0.0, "other_s": 5.0},

@@ -8,10 +8,9 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Batches, SparseRows
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, Gaussian, Linear
-from memcomp_lightning.modules import LOSSES
 from memcomp_lightning.objective import contrast, weighted
-from memcomp_lightning.replicas.backprop import gradient_of
 from memcomp_lightning.samplers import CD, ExactPosterior, MeanField, positive_phase
+from memcomp_lightning.training import LOSSES, ClassifierStep
 from memcomp_lightning.types import Batch, Configurations, NoState
 
 
@@ -117,7 +116,7 @@ def test_the_loss_takes_a_weight_as_repeats(closed_form, loss):
 
     def gradient(batch):
         network.zero_grad()
-        gradient_of(network, loss)(batch)
+        ClassifierStep(network, loss).add_gradient(batch)
         return [p.grad.clone() for p in network.parameters() if p.grad is not None]
 
     repeats = weight.long()

@@ -5,10 +5,10 @@ with sigmoid units, or with batch normalisation and ReLU, get their gradient in 
 in half the time or less. All others get it by autograd.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,19 +16,66 @@ from torch.nn import Parameter
 
 from memcomp_lightning.models import DBN, RBM, BatchNorm, BatchNormReluNetwork, Linear
 from memcomp_lightning.models.affine import affine
-from memcomp_lightning.modules import Loss, cross_entropy, squared_error
+from memcomp_lightning.training.losses import Loss, cross_entropy, squared_error
 from memcomp_lightning.types import Batch
 
-AddGradient = Callable[[Batch], None]
-"""Adds the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
+
+class ClassifierStep:
+    """The gradient of a network's mean loss, batch by batch.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits ``(*replicas, n, n_classes)``.
+        loss: Of each image.
+    """
+
+    def __init__(self, network: nn.Module, loss: Loss = cross_entropy) -> None:
+        self._network, self._loss = network, loss
+        layers, of_logits = _layers_of(network), _OF_LOGITS.get(loss)
+        self._closed_form = (
+            None if layers is None or of_logits is None else partial(_backward_all, layers, of_logits)
+        )
+
+    def add_gradient(self, batch: Batch) -> None:
+        """Add the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
+        if self._closed_form is None:
+            self._by_autograd(batch)[0].backward()
+            return
+        for parameter, gradient in self._closed_form(batch).gradients:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Return ``share * mean loss``, summed over the replicas, to be differentiated once, and the logits."""
+        if self._closed_form is None:
+            return self._by_autograd(batch)
+        logits, found = self._closed_form(batch)
+        parameters, gradients = zip(*found, strict=True)
+        value = _total(self._loss(logits, batch.label), batch)
+        apply: Callable[..., Tensor] = _WithGradient.apply
+        return apply(value, gradients, *parameters), logits
+
+    def _by_autograd(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        logits = self._network(batch.v)
+        return _total(self._loss(logits, batch.label), batch), logits.detach()
 
 
-def gradient_of(network: nn.Module, loss: Loss = cross_entropy) -> AddGradient:
-    """Return what adds the gradient of a network's parameters; the network is in training mode."""
-    layers, of_logits = _layers_of(network), _OF_LOGITS.get(loss)
-    if layers is None or of_logits is None:
-        return partial(_by_autograd, network, loss)
-    return partial(_in_closed_form, layers, of_logits)
+def _total(losses: Tensor, batch: Batch) -> Tensor:
+    share = _share_of_each(batch)
+    return losses.sum() * share if isinstance(share, float) else (losses * share.squeeze(-2)).sum()
+
+
+class _WithGradient(torch.autograd.Function):
+    """A number whose gradient by some parameters is known already."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, gradients: Sequence[Tensor], *parameters: Parameter) -> Tensor:
+        """Return the number."""
+        ctx.gradients = gradients
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, by_value: Tensor) -> Any:
+        """Return the gradients."""
+        return None, None, *(gradient * by_value for gradient in ctx.gradients)
 
 
 def _of_cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
@@ -38,7 +85,7 @@ def _of_cross_entropy(logits: Tensor, label: Tensor) -> Tensor:
 
 def _of_squared_error(logits: Tensor, label: Tensor) -> Tensor:
     """(s - y) s (1 - s) with the sigmoid s and one-hot y."""
-    s = logits.sigmoid_()
+    s = logits.sigmoid()
     gradient: Tensor = torch.ops.aten.sigmoid_backward(_less_one_hot(s.clone(), label), s)
     return gradient
 
@@ -72,6 +119,8 @@ def _layers_of(network: nn.Module) -> list[_Layer] | None:
     """The layers from the inputs up; None for a network that is not made of them alone, or does not end linear."""
     layers: list[_Layer] = []
     for module in _flat(network):
+        if not module.training or module._forward_hooks or module._forward_pre_hooks:
+            return None  # what looks at a module's output, or has frozen its statistics, sees autograd's way
         if type(module) is RBM:
             layers.append(_Layer(module.weight, module.c, "sigmoid"))
         elif type(module) is Linear:
@@ -99,25 +148,33 @@ def _flat(network: nn.Module) -> Iterator[nn.Module]:
         yield network
 
 
+class _Found(NamedTuple):
+    """Logits ``(*replicas, n, n_classes)``, and the gradient of each parameter."""
+
+    logits: Tensor
+    gradients: list[tuple[Parameter, Tensor]]
+
+
 @torch.no_grad()
-def _in_closed_form(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch) -> None:
+def _backward_all(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch) -> _Found:
     r"""Back-propagation: ``\delta_{l-1} = \delta_l W_l \odot f'``."""
     below, norms = [batch.v], []
     for layer in layers[:-1]:
         activation, norm = _forward(layer, below[-1])
         below.append(activation)
         norms.append(norm)
-    top = layers[-1]
+    top, found = layers[-1], []
     logits = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1))
     delta = of_logits(logits, batch.label).mul_(_share_of_each(batch)).mT
     for number in range(len(layers) - 1, -1, -1):
         layer = layers[number]
         if number < len(layers) - 1:
-            delta = _backward(layer, delta, below[number + 1], norms[number])
-        _add(layer.weight, delta.mT @ below[number])
-        _add(layer.bias, delta.sum(-2))
+            delta, of_norm = _backward(layer, delta, below[number + 1], norms[number])
+            found += of_norm
+        found += [(layer.weight, delta.mT @ below[number]), (layer.bias, delta.sum(-2))]
         if number > 0:
             delta = delta @ layer.weight
+    return _Found(logits.mT, found)
 
 
 class _Normalised(NamedTuple):
@@ -149,32 +206,22 @@ def _forward(layer: _Layer, x: Tensor) -> tuple[Tensor, _Normalised | None]:
     return z.sigmoid_() if layer.units == "sigmoid" else z.relu_(), saved
 
 
-def _backward(layer: _Layer, delta: Tensor, activation: Tensor, saved: _Normalised | None) -> Tensor:
-    """From the gradient of a hidden layer's activations to that of its affine map."""
+def _backward(
+    layer: _Layer, delta: Tensor, activation: Tensor, saved: _Normalised | None
+) -> tuple[Tensor, list[tuple[Parameter, Tensor]]]:
+    """From the gradient of a hidden layer's activations to that of its affine map, and of its normalisation."""
     if layer.units == "sigmoid":
         delta = torch.ops.aten.sigmoid_backward(delta, activation)
     else:
         delta = torch.ops.aten.threshold_backward(delta, activation, 0)
     if saved is None or layer.norm is None:
-        return delta
+        return delta, []
     normalised = saved.z * saved.inverse_std
     shift, scale = delta.sum(-2), (delta * normalised).sum(-2)
-    _add(layer.norm.bias, shift)
-    _add(layer.norm.weight, scale)
     if saved.by_batch:
         n = delta.shape[-2]
         delta = delta.sub_((shift / n).unsqueeze(-2)).addcmul_(normalised, (scale / n).unsqueeze(-2), value=-1)
-    return delta.mul_(saved.scale)
-
-
-def _add(parameter: Parameter, gradient: Tensor) -> None:
-    parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-
-
-def _by_autograd(network: nn.Module, loss: Loss, batch: Batch) -> None:
-    share = _share_of_each(batch)
-    losses = loss(network(batch.v), batch.label)
-    (losses.sum() * share if isinstance(share, float) else (losses * share.squeeze(-2)).sum()).backward()
+    return delta.mul_(saved.scale), [(layer.norm.bias, shift), (layer.norm.weight, scale)]
 
 
 def _share_of_each(batch: Batch) -> float | Tensor:

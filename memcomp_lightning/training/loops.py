@@ -1,0 +1,256 @@
+"""The bare loops: pretraining and fine-tuning of any replicas, without a trainer.
+
+They do what ``EnergyPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and, on the
+CPU, draw for draw: a replica here ends with the weights of the run that trains it alone. On another device chains
+are drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out looks at
+training, which costs more than an update of a small network.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, cast
+
+import torch
+from torch import Generator, nn
+
+from memcomp_lightning import rng
+from memcomp_lightning.ambient import with_gradient
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.objective import Centring, weighted
+from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.training.backprop import ClassifierStep
+from memcomp_lightning.training.best import BestPass
+from memcomp_lightning.training.diverged import require_finite
+from memcomp_lightning.training.losses import Loss, cross_entropy
+from memcomp_lightning.training.schedules import OptimizerFactory, Schedule, begin_pass
+from memcomp_lightning.training.score import evaluate
+from memcomp_lightning.training.stages import Phase, PretrainingStage
+from memcomp_lightning.training.step import EnergyStep, StepState
+from memcomp_lightning.types import Batch, Configurations
+
+
+class Batches(Protocol):
+    """The images of a training set in the order of a pass, as updates: :class:`memcomp_lightning.data.Batches`."""
+
+    def __iter__(self) -> Iterator[Batch]:
+        """The batches of the present pass."""
+        ...
+
+    def set_epoch(self, epoch: int) -> None:
+        """Take the order of a pass, by its number from 0 in the stage."""
+        ...
+
+
+class Pass(NamedTuple):
+    """What a pass of pretraining leaves.
+
+    Attributes:
+        number: Passes done, from 1, over all phases.
+        state: Of the sampler.
+        positive: Positive phase of the last batch.
+    """
+
+    number: int
+    state: Any
+    positive: Configurations
+
+
+def pretrain(
+    stage: PretrainingStage,
+    batches: Batches,
+    sampler: NegativePhaseSampler[Any, Any],
+    *,
+    iterations: int,
+    optimizer: OptimizerFactory,
+    schedules: Sequence[Schedule] = (),
+    centring: Centring | None = None,
+    seed: int = 0,
+) -> Iterator[Pass]:
+    """Train the models of a stage one after the other, in place; yield each pass once it is done.
+
+    Args:
+        stage: A way of pretraining, with its network.
+        batches: Images with the network's replica axis.
+        sampler: Supplies the negative phase.
+        iterations: Passes over the training set for each model, >= 0.
+        optimizer: Builds the optimiser of one model, element-wise, so that replicas stay independent.
+        schedules: Change the optimiser from pass to pass, for each model anew.
+        centring: Settings of the centred gradient; None follows the plain one.
+        seed: Of the random streams.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations, minimum=0)
+    # On the parameters' device: a draw from elsewhere would be copied in each update, and the copy would wait.
+    device = next(stage.network.parameters()).device
+    streams = {name: rng.stream(seed, name, device=device) for name in ("negative_phase", "positive_phase")}
+    for number, phase in enumerate(stage.phases):
+        training = PhaseTraining(
+            phase, sampler, optimizer=optimizer, schedules=schedules, centring=centring, streams=streams
+        )
+        for epoch in range(number * iterations, (number + 1) * iterations):
+            batches.set_epoch(epoch)
+            done = training.run_pass(batches)
+            stage.hand_over()
+            yield done._replace(number=epoch + 1)
+        require_finite(cast(nn.Module, phase.model), f"pretraining, {phase.name}")
+
+
+class PhaseTraining:
+    """One model that follows the contrast: its optimiser, its chains and its centres, kept from pass to pass.
+
+    Can be pickled where the phase can.
+
+    Args:
+        phase: The energy model, trained in place, and what it sees.
+        sampler: Supplies the negative phase.
+        optimizer: Builds the optimiser.
+        schedules: Change the optimiser from pass to pass.
+        centring: Settings of the centred gradient; None follows the plain one.
+        streams: Generators by the names "negative_phase" and "positive_phase".
+
+    Attributes:
+        passes_done: How many.
+    """
+
+    def __init__(
+        self,
+        phase: Phase,
+        sampler: NegativePhaseSampler[Any, Any],
+        *,
+        optimizer: OptimizerFactory,
+        schedules: Sequence[Schedule] = (),
+        centring: Centring | None,
+        streams: Mapping[str, Generator],
+    ) -> None:
+        self.phase = phase
+        self.step = EnergyStep(sampler=sampler, centring=centring)
+        self.schedules = schedules
+        self.streams = streams
+        self.optimizer = optimizer(phase.model.parameters())
+        self.passes_done = 0
+        self._state = StepState()
+
+    @property
+    def state(self) -> Any:
+        """Of the sampler."""
+        return self._state.sampler
+
+    def go_on_with(self, sampler: NegativePhaseSampler[Any, Any], centring: Centring | None) -> None:
+        """Take other settings for the passes that follow; another sampler starts anew."""
+        if sampler != self.step.sampler:
+            self._state = self._state._replace(sampler=None)
+        self.step = EnergyStep(sampler=sampler, centring=centring)
+
+    def run_pass(self, batches: Iterable[Batch]) -> Pass:
+        """Update the model by each step of the batches, once."""
+        with with_gradient():
+            return self._run_pass(batches)
+
+    def _run_pass(self, batches: Iterable[Batch]) -> Pass:
+        begin_pass(self.schedules, self.optimizer, self.passes_done)
+        state, phase = self._state, self.phase
+        for batch in batches:
+            with torch.no_grad():
+                found = phase.positive(phase.visible_of(batch.v), self.streams["positive_phase"])
+                positive = weighted(found.configurations, batch.weight)
+            gap, _, state = self.step.contrast(
+                phase.model, positive, state, generator=self.streams["negative_phase"]
+            )
+            (batch.share * gap.sum()).backward()
+            if batch.closes_step:
+                self.optimizer.step()
+                self.optimizer.zero_grad()
+                state = state.after_update()
+        self.passes_done += 1
+        self._state = state
+        return Pass(self.passes_done, self.state, positive)
+
+
+class ClassifierTraining:
+    """A network that follows the gradient of its loss: its optimiser, kept from pass to pass.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits; trained in place.
+        optimizer: Builds the optimiser.
+        schedules: Change the optimiser from pass to pass.
+        loss: Of each image.
+
+    Attributes:
+        passes_done: How many.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        optimizer: OptimizerFactory,
+        schedules: Sequence[Schedule] = (),
+        loss: Loss = cross_entropy,
+    ) -> None:
+        self.network = network
+        self.schedules = schedules
+        self.loss = loss
+        self.optimizer = optimizer(network.parameters())
+        self.passes_done = 0
+
+    def run_pass(self, batches: Iterable[Batch]) -> None:
+        """Update the network by each step of the batches, once; it is in evaluation mode afterwards."""
+        self.network.train()
+        begin_pass(self.schedules, self.optimizer, self.passes_done)
+        with with_gradient():
+            step = ClassifierStep(self.network, self.loss)
+            for batch in batches:
+                step.add_gradient(batch)
+                if batch.closes_step:
+                    self.optimizer.step()
+                    self.optimizer.zero_grad()
+        self.network.eval()
+        self.passes_done += 1
+
+
+def finetune(
+    network: nn.Module,
+    batches: Batches,
+    *,
+    iterations: int,
+    optimizer: OptimizerFactory,
+    schedules: Sequence[Schedule] = (),
+    loss: Loss = cross_entropy,
+    keep_best_by: Batch | None = None,
+) -> Iterator[int]:
+    """Minimise the loss of a network in place; yield the number of each pass once it is done.
+
+    The network is in evaluation mode while the caller has it, and nothing waits for the device in between.
+
+    Args:
+        network: Maps inputs ``(*replicas, n, n_visible)`` to logits.
+        batches: Its images, with its replica axis.
+        iterations: Passes over the training set, >= 1.
+        optimizer: Builds the optimiser, element-wise, so that replicas stay independent.
+        schedules: Change the optimiser from pass to pass.
+        loss: Of each image.
+        keep_best_by: Held-out images: at each yield the network has, replica by replica, the weights of the pass
+            that classified them best so far. None keeps the newest ones.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    require_count("iterations", iterations)
+    training = ClassifierTraining(network, optimizer=optimizer, schedules=schedules, loss=loss)
+    best = BestPass()
+    for iteration in range(iterations):
+        batches.set_epoch(iteration)
+        training.run_pass(batches)
+        is_last = iteration + 1 == iterations
+        if is_last:
+            require_finite(network, "fine-tuning")
+        if keep_best_by is None:
+            yield iteration + 1
+            continue
+        best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
+        newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        network.load_state_dict(best.weights)
+        yield iteration + 1
+        if not is_last:
+            network.load_state_dict(newest)

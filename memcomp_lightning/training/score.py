@@ -1,0 +1,55 @@
+"""How many images a network classifies correctly, and its mean loss on them."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from memcomp_lightning.training.losses import Loss, cross_entropy
+
+
+class Score(NamedTuple):
+    """Sums over images, so that chunks add up.
+
+    Attributes:
+        loss: Sum of the losses, ``(*replicas,)``.
+        n_correct: Images whose largest logit is their label's, ``(*replicas,)``.
+        n_images: Images a replica.
+    """
+
+    loss: Tensor
+    n_correct: Tensor
+    n_images: int
+
+    def __add__(self, other: object) -> "Score":
+        """Score of both sets of images together."""
+        if not isinstance(other, Score):
+            return NotImplemented
+        return Score(self.loss + other.loss, self.n_correct + other.n_correct, self.n_images + other.n_images)
+
+    @property
+    def accuracy(self) -> Tensor:
+        """Share of images classified correctly, ``(*replicas,)`` in [0, 1]."""
+        return self.n_correct.float() / self.n_images
+
+    @property
+    def mean_loss(self) -> Tensor:
+        """Mean loss, ``(*replicas,)``."""
+        return self.loss / self.n_images
+
+
+def score(logits: Tensor, label: Tensor, loss: Loss = cross_entropy) -> Score:
+    """Return the score of logits ``(*replicas, n, n_classes)`` against labels ``(*replicas, n)``."""
+    n_correct = (logits.argmax(-1) == label).sum(-1)
+    return Score(loss(logits, label).sum(-1), n_correct, label.shape[-1])
+
+
+@torch.no_grad()
+def evaluate(network: nn.Module, batches: Any, loss: Loss = cross_entropy) -> Score:
+    """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
+    was_training = network.training
+    network.eval()
+    like = next(network.parameters())
+    scores = [score(network(batch.v.to(like)), batch.label.to(like.device), loss) for batch in batches]
+    network.train(was_training)
+    return sum(scores[1:], start=scores[0])

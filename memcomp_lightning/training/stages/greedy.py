@@ -1,0 +1,56 @@
+"""Greedy pretraining of a deep belief network: one RBM after the other."""
+
+from functools import partial
+
+from torch import Generator, Tensor
+
+from memcomp_lightning.errors import require
+from memcomp_lightning.models import DBN, RBM
+from memcomp_lightning.samplers import PositivePhase, positive_phase
+from memcomp_lightning.training.stages.base import Phase
+
+
+class Greedy:
+    """Train each RBM of a DBN on the mean activations of the layers below it.
+
+    Activations are computed batch by batch and never held for the whole data set.
+
+    Args:
+        network: The DBN; trained in place.
+
+    Raises:
+        SettingError: The network is no DBN.
+    """
+
+    def __init__(self, network: DBN) -> None:
+        require_dbn(network)
+        self.network = network
+        self.phases = [_phase(network, layer) for layer in range(len(network))]
+
+    def hand_over(self) -> None:
+        """Nothing to do: the RBMs are the DBN's own."""
+
+
+def require_dbn(network: object) -> None:
+    """Refuse everything else.
+
+    Raises:
+        SettingError: Naming what it is.
+    """
+    remedy = "For a Boltzmann machine use pretrain=boltzmann."
+    require(isinstance(network, DBN), "pretrained network", type(network).__name__, "a DBN", remedy)
+
+
+def _phase(dbn: DBN, layer: int) -> Phase:
+    return Phase(
+        name=f"layer {layer + 1}",
+        tag=f"layer{layer + 1}",
+        model=dbn[layer],
+        positive=partial(_hidden_means, dbn[layer]),
+        visible_of=partial(dbn.visible_of, layer),
+        images_of=partial(dbn.images_of, layer),
+    )
+
+
+def _hidden_means(rbm: RBM, v: Tensor, generator: Generator) -> PositivePhase:
+    return PositivePhase(positive_phase(rbm, v), {})

@@ -1,0 +1,80 @@
+"""The loops without a trainer train what a run trains, bit for bit: a trial is the run that it decides."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from running import QUIET, Outcome
+
+from memcomp_lightning.cli.build import build
+from memcomp_lightning.cli.hydra_versions import INITIALIZE
+from memcomp_lightning.cli.overrides import CONFIG_MODULE
+from memcomp_lightning.cli.units import pretrained
+from memcomp_lightning.modules import Classifier
+from memcomp_lightning.training import finetune
+
+Run = Callable[..., Outcome]
+ROOT = Path(__file__).parents[2]
+
+SMALL = [
+    *(*QUIET, "data=shifting_bars", "model.hidden_sizes=[5,4]", "choose=null", "seed=3"),
+    *("pretrain.iterations=3", "pretrain.batch_size=7", "finetune.iterations=3", "finetune.batch_size=5"),
+]
+DMM = ["solver.max_steps=20", "solver.n_restarts=5"]
+NOT_HERE = {
+    "dwave_qpu": "asks a machine",
+    "annealer": "draws from a random stream of its own",
+}
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (ROOT / "conf" / group).glob("*.yaml"))
+
+
+def schedule(name: str, stage: str) -> str:
+    kinds = {"momentum": "MomentumSchedule,switch_at:2", "decay": "LearningRateDecay,n_passes:3"}
+    return f"{stage}.schedules.{name}={{_target_:memcomp_lightning.training.{kinds[name]}}}"
+
+
+SCHEDULES = [schedule(name, stage) for name in ("momentum", "decay") for stage in ("pretrain", "finetune")]
+CASES = [
+    *([f"sampler={sampler}", *SCHEDULES] for sampler in options("sampler") if sampler not in NOT_HERE),
+    *([f"control={control}"] for control in options("control")),
+    ["sampler=pcd", "pretrain=greedy", SCHEDULES[0]],
+    ["sampler=mode_assisted_pcd", "pretrain=joint", *SCHEDULES],
+    ["control=bn_relu", "finetune.keep_best=true", "data.validation_fraction=0.2", SCHEDULES[3]],
+    ["sampler=cd", "finetune.loss=squared_error", "finetune.units=batch_norm_relu", "data.partitions=2"],
+]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: " ".join(case)[:60])
+def test_a_loop_without_a_trainer_ends_with_the_weights_of_the_run(memcomp_train: Run, case: list[str]) -> None:
+    uses_dmm = not any(part in " ".join(case) for part in ("annealing", "descent", "exact", "boltzmann"))
+    # The case comes last but for what keeps it small: controls may choose.
+    overrides = [*SMALL, *(DMM if uses_dmm else []), *case]
+    if case[0].startswith("sampler=exact"):
+        overrides.append("model.hidden_sizes=[5]")
+    outcome = memcomp_train(*overrides, "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    expected = torch.load("run/weights/finetune.pt", weights_only=True)
+    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+        config = compose("config", overrides)
+        plan = pretrained(build(config), config.seed, torch.device("cpu"))
+    assert plan.finetuning is not None
+    module, data = plan.finetuning.module, plan.finetuning.data
+    assert isinstance(module, Classifier)
+    passes = finetune(
+        module.network,
+        data.train_batches(0, 1),
+        iterations=module.iterations,
+        optimizer=module.make_optimizer,
+        schedules=module.schedules,
+        loss=module.loss,
+        keep_best_by=next(iter(data.val_dataloader())) if config.finetune.keep_best else None,
+    )
+    assert len(list(passes)) == 3
+    found = module.network.state_dict()
+    assert found.keys() == expected.keys()
+    assert [name for name, tensor in expected.items() if not tensor.equal(found[name])] == []
