@@ -18,7 +18,7 @@ pytestmark = pytest.mark.xdist_group("notebooks")  # one worker, one kernel
 NOTEBOOKS = {path.stem: path for path in sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))}
 
 SHORTER = {
-    "01_train_and_inspect": {"iterations=20)": "iterations=2)", "iterations=60": "iterations=2"},
+    "01_train_and_inspect": {"iterations=20,": "iterations=2,", "iterations=60": "iterations=2"},
     "02_the_machine": {"DmmSolver(n_restarts=100)": "DmmSolver(n_restarts=10)"},
     "03_swap_the_negative_phase": {
         "N_SEEDS, N_UPDATES = 10, 2000": "N_SEEDS, N_UPDATES = 2, 200",
