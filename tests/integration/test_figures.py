@@ -13,7 +13,6 @@ import hydra
 import pytest
 import torch
 from running import HANGS_AFTER, QUIET, Outcome
-from test_command_line import options
 
 from memcomp_lightning.cli import figures, report
 from memcomp_lightning.cli.commands import report as pages
