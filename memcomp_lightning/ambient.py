@@ -61,3 +61,14 @@ def on_the_cpu() -> Iterator[None]:
     elsewhere = torch.get_default_device().type != "cpu"
     with with_gradient(), torch.device("cpu") if elsewhere else nullcontext():
         yield
+
+
+@contextmanager
+def in_one_thread() -> Iterator[None]:
+    """Compute in one thread, and then in as many as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

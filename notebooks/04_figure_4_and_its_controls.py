@@ -27,8 +27,8 @@ from pathlib import Path
 
 from IPython.display import Markdown
 
-from memcomp_lightning.plotting import plot_against_iterations, plot_controls
-from memcomp_lightning.report import markdown, read_results, verdicts
+from memcomp_lightning.studies import markdown, read_results, verdicts
+from memcomp_lightning.studies.plot_accuracy import plot_against_iterations, plot_controls
 
 folder = Path(tempfile.mkdtemp())
 command = [

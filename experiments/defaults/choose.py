@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 from memcomp_lightning.cli.hydra_versions import INITIALIZE
 from memcomp_lightning.cli.overrides import CONFIG_MODULE
-from memcomp_lightning.cli.units import Member, Unit, run_unit
+from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
 
 SPLITS = (100, 101, 102)
 """Seeds of runs and of splits into training and test images, others than those of the table that is reported."""

@@ -12,7 +12,7 @@ import torch
 from memcomp_lightning.data import ImageData, ReducedMnist
 from memcomp_lightning.likelihood import log_likelihood, log_partition_function
 from memcomp_lightning.models import RBM
-from memcomp_lightning.report.worth import read_worth, weights_path
+from memcomp_lightning.studies.worth import read_worth, weights_path
 
 IMAGES = {"reduced_mnist": lambda: ReducedMnist(pixels="threshold").load()}
 

@@ -13,9 +13,9 @@ from memcomp_lightning import rng
 from memcomp_lightning.models import RBM
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.problems import from_model
-from memcomp_lightning.report.worth import read_worth, weights_path
 from memcomp_lightning.solvers import GibbsAnnealing
 from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.studies.worth import read_worth, weights_path
 
 
 def lowest_energy(rbm: RBM) -> torch.Tensor:

@@ -4,7 +4,6 @@ import copy
 import math
 import re
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,45 +23,14 @@ from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
-from memcomp_lightning.models import DBN, BoltzmannMachine, Randomiser, start_at_means
-from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining, StageModule
+from memcomp_lightning.models import DBN, BoltzmannMachine, start_at_means
+from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
 from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
+from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import OptimizerFactory, Schedule
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One fit: a module, its data and its callbacks."""
-
-    module: StageModule
-    data: ImageDataModule
-    callbacks: list[pl.Callback]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """All that a run needs.
-
-    Attributes:
-        network: What is trained; the stages share it.
-        pretraining: The first stage, None for a network without pretraining.
-        finetuning: The last stage, None if left out.
-        between: Changes the network after its pretraining, None if nothing does.
-    """
-
-    network: nn.Module
-    pretraining: Stage | None
-    finetuning: Stage | None
-    between: Randomiser | None = None
-
-    @property
-    def stages(self) -> list[Stage]:
-        """The stages in order."""
-        return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
-
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _GROUPS = (
@@ -110,7 +78,7 @@ def build(config: DictConfig) -> Plan:
     network = _network(config, images)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
-    pretraining = finetuning = None
+    pretraining = finetuning = stage_for = None
     if isinstance(network, DBN | BoltzmannMachine) and config.pretrain.iterations > 0:
         callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
         centring = _part(config.pretrain.centring, "pretrain.centring")
@@ -121,8 +89,9 @@ def build(config: DictConfig) -> Plan:
         if initial_bias == "data" and config.model.weights is None:
             start_at_means(network[0] if isinstance(network, DBN) else network, data.train[0])
         schedules = _schedules(config, "pretrain")
+        stage_for = instantiate(config.pretrain.stage)
         try:
-            stage = instantiate(config.pretrain.stage)(network)
+            stage = stage_for(network)
         except TypeError as error:
             raise UserError(f"pretrain.stage: {error}") from error
         module = EnergyPretraining(
@@ -177,7 +146,7 @@ def build(config: DictConfig) -> Plan:
             classifier = Classifier(network, **settings)
         finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
-    plan = Plan(network, pretraining, finetuning, between)
+    plan = Plan(network, pretraining, finetuning, between, stage_for)
     require(
         bool(plan.stages),
         "finetune.iterations",
@@ -185,6 +154,11 @@ def build(config: DictConfig) -> Plan:
         "an integer >= 1 where there is no pretraining",
     )
     return plan
+
+
+def plan_of(settings: Mapping[str, Any]) -> Plan:
+    """Build the objects of a run from its settings as plain values."""
+    return build(OmegaConf.create(dict(settings)))
 
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:

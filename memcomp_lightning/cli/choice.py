@@ -8,11 +8,12 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from memcomp_lightning.cli.build import plan_of
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.units import Member, Unit, run_unit
 from memcomp_lightning.errors import require, require_choice
 from memcomp_lightning.files import write_text
+from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
 
 HELD_OUT = 0.1
 """Share of the training images that judge, unless ``data.validation_fraction`` sets one."""
@@ -77,7 +78,7 @@ def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str,
     for number, value in enumerate(values, start=1):
         trial = for_trial(config, value)
         plain: Any = OmegaConf.to_container(trial, resolve=False)
-        member = Member("choose", plain, trial.pretrain.iterations, trial.seed, value, choosing=True)
+        member = Member("choose", plain, plan_of, trial.pretrain.iterations, trial.seed, value, choosing=True)
         (record,) = run_unit(Unit((member,), (trial.finetune.iterations,), 0), lambda what, n_updates: None)
         accuracies.append(float(record.score("validation_accuracy").mean()))
         log.info(

@@ -3,7 +3,7 @@
 import functools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,14 @@ from hydra import compose
 from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from memcomp_lightning.cli.build import build, check_without_trainer
+from memcomp_lightning.cli.build import build, check_without_trainer, plan_of
 from memcomp_lightning.cli.choice import for_trial, tried_values, with_choice
 from memcomp_lightning.cli.overrides import check_entry, check_not_given, search_paths
-from memcomp_lightning.cli.units import Member, Unit, device_of, plan_of, run_unit, tuning
-from memcomp_lightning.cli.workers import run_all, runner
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
-from memcomp_lightning.report import Plan, Records
+from memcomp_lightning.studies import FigurePlan, Records
+from memcomp_lightning.studies.accuracy import Member, grouped, run_unit
+from memcomp_lightning.studies.runner import run_all, runner
 
 _SET_BY_FIGURE = {
     "pretrain.iterations": "It has figure.iterations.",
@@ -38,7 +38,12 @@ def train_curves(config: DictConfig, overrides: Sequence[str], folder: Path) -> 
     composed = _curves(config, overrides)
     with runner(config.figure.workers, config.trainer.accelerator, run_unit) as run:
         for choosing in (True, False):
-            units = plan_units(config, composed, records, choosing=choosing)
+            members = [
+                member
+                for name, settings in composed.items()
+                for member in _members(config, name, settings, records, choosing=choosing)
+            ]
+            units = grouped(members, tuple(sorted(config.figure.passes)), networks=config.figure.networks)
             if units:
                 run_all(run, units, records, config.figure.name)
 
@@ -59,7 +64,7 @@ def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictC
 
 
 def _shown(config: DictConfig, overrides: Sequence[str]) -> dict[str, Any]:
-    """What the report needs to know of the settings: ``report.Plan``."""
+    """What the report needs to know of the settings: ``studies.FigurePlan``."""
     figure = OmegaConf.to_container(config.figure, resolve=True)
     assert isinstance(figure, dict)
     curves, composed = figure["curves"], _curves(config, overrides)
@@ -95,7 +100,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     for name, curve in config.figure.curves.items():
         check_entry(f"figure.curves.{name}", curve, CURVE_SETTINGS)
         _require_list(f"figure.curves.{name}.iterations", curve.get("iterations", [1]))
-    Plan.of(_shown(config, overrides))
+    FigurePlan.of(_shown(config, overrides))
     for name, settings in _curves(config, overrides).items():
         values = tried_values(settings)
         if values:
@@ -109,26 +114,6 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
 def _require_list(name: str, values: Any) -> None:
     fits = isinstance(values, ListConfig | list) and len(values) > 0
     require(fits, name, values, "a list of numbers, at least one: [1, 5]")
-
-
-def plan_units(
-    config: DictConfig, composed: Mapping[str, DictConfig], records: Records, *, choosing: bool
-) -> list[Unit]:
-    """What is to be trained and has no record yet, the choices or the curves themselves."""
-    passes = tuple(sorted(config.figure.passes))
-    groups: dict[str, list[Member]] = {}
-    for name, settings in composed.items():
-        for member in _members(config, name, settings, records, choosing=choosing):
-            groups.setdefault(member.fine_tuning, []).append(member)
-    units = []
-    for members in groups.values():
-        each, n_replicas = _updates(members[0], passes[-1])
-        size = _n_members(config, len(members), n_replicas)
-        for start in range(0, len(members), size):
-            some = tuple(members[start : start + size])
-            units.append(Unit(some, passes, each * len(some)))
-    # The longest first, so that no process is left alone with one at the end.
-    return sorted(units, key=lambda unit: -unit.n_updates)
 
 
 def _members(
@@ -151,7 +136,7 @@ def _members(
             if value is not None:
                 settings = for_trial(composed, value) if choosing else with_choice(composed, value)
             plain: Any = OmegaConf.to_container(settings, resolve=False)
-            yield from (Member(name, plain, n, seed, value, choosing) for n, seed in missing)
+            yield from (Member(name, plain, plan_of, n, seed, value, choosing) for n, seed in missing)
 
 
 def composed_for(common: tuple[str, ...], own: tuple[str, ...] = ()) -> DictConfig:
@@ -190,24 +175,3 @@ def _applies(name: str, config: DictConfig) -> bool:
     parent, _, key = name.rpartition(".")
     node = OmegaConf.select(config, parent)
     return isinstance(node, DictConfig) and key in node
-
-
-def _n_members(config: DictConfig, n_all: int, n_replicas: int) -> int:
-    """How many members train as one program: replicas are what counts, in programs of about one size."""
-    networks = config.figure.networks
-    if networks is None:
-        networks = 10_000 if device_of(config.trainer.accelerator).type != "cpu" else _IN_CACHE
-    require_count("figure.networks", networks)
-    most = max(1, int(networks // n_replicas))
-    return math.ceil(n_all / math.ceil(n_all / most))
-
-
-_IN_CACHE = 40
-"""Small networks that one CPU core trains fastest side by side: fewer wait for Python, more leave the cache."""
-
-
-def _updates(member: Member, n_passes: int) -> tuple[int, int]:
-    """Updates of all replicas of a network, and how many replicas it has."""
-    data = tuning(plan_of(member, n_passes)).data
-    n_replicas = math.prod(data.replicas)
-    return len(data.train_batches(0, 1)) * n_replicas * n_passes, n_replicas

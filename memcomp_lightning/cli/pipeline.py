@@ -14,7 +14,6 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
-from memcomp_lightning.cli.build import Plan, Stage
 from memcomp_lightning.cli.errors import UserError, explain
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.run_folder import RunFolder
@@ -25,6 +24,7 @@ from memcomp_lightning.data.baselines import independent_log_likelihood, logisti
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
 from memcomp_lightning.modules.weights import check_checkpoint
+from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
 
 log = logging.getLogger(__name__)

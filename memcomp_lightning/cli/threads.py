@@ -4,24 +4,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
-import torch
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli.build import Stage
+from memcomp_lightning.ambient import in_one_thread
+from memcomp_lightning.studies.plan import Stage
 
 WORTH_THREADS = 2**22
 """Products of a unit and a weight in an update from which a second thread helps: about a millisecond."""
-
-
-@contextmanager
-def in_one_thread() -> Iterator[None]:
-    """Compute in one thread, and then in as many as before."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @contextmanager

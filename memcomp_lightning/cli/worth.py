@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.cli.build import build, check_without_trainer
+from memcomp_lightning.cli.build import build, check_without_trainer, plan_of
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.overrides import check_entry, check_not_given
-from memcomp_lightning.cli.workers import run_all, runner
-from memcomp_lightning.cli.worth_job import Job, model_of, module_of, run_job, side_by_side
-from memcomp_lightning.cli.worth_measures import MEASURES, measure_of
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.files import write_text
-from memcomp_lightning.report.worth import Courses
+from memcomp_lightning.studies.likelihood import Job, model_of, module_of, run_job, side_by_side
+from memcomp_lightning.studies.measures import MEASURES
+from memcomp_lightning.studies.runner import run_all, runner
+from memcomp_lightning.studies.worth import Courses
 
 DATA_SETTINGS = ("label", "overrides", "passes", "measure", "methods", "rates", "replicas", "choosing", "points")
 _SET_BY_COMPARISON = {"pretrain.iterations": "It has passes of its data sets.", "sampler": "It has methods."}
@@ -61,14 +61,14 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
     seen: set[tuple[str, str]] = set()
     for job in _jobs(config, overrides, Path(), done=set()):
-        own = OmegaConf.create(job.config)
+        own = OmegaConf.create(job.settings)
         plan = build(own)
         check_without_trainer(plan, own)
         data, model = module_of(plan)[0].data, model_of(side_by_side([plan]))
         require(data.replicas == (), "data.partitions", data.replicas, "1: replicas are seeds here")
         if (job.data_set, job.method) not in seen:
             seen.add((job.data_set, job.method))
-            measure = measure_of(job.measure, data, 1)
+            measure = MEASURES[job.measure](data, 1)
             if job.measure != "ais":  # which refuses no model of two classes, and takes its time
                 measure(model)
 
@@ -107,6 +107,7 @@ def _jobs(config: DictConfig, overrides: Sequence[str], folder: Path, done: set[
                     float(rate),
                     str(folder),
                     own,
+                    plan_of,
                     n_reported,
                     n_choosing,
                     _points(schedule.passes, n_points),

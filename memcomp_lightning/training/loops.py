@@ -242,15 +242,14 @@ def finetune(
     for iteration in range(iterations):
         batches.set_epoch(iteration)
         training.run_pass(batches)
-        is_last = iteration + 1 == iterations
-        if is_last:
-            require_finite(network, "fine-tuning")
-        if keep_best_by is None:
-            yield iteration + 1
-            continue
-        best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
-        newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-        network.load_state_dict(best.weights)
+        newest = None
+        if keep_best_by is not None:
+            best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
+            newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+            network.load_state_dict(best.weights)
         yield iteration + 1
-        if not is_last:
+        if newest is not None:
             network.load_state_dict(newest)
+    require_finite(network, "fine-tuning")
+    if best.weights:
+        network.load_state_dict(best.weights)

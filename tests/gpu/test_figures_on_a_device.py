@@ -8,8 +8,8 @@ import stand_in
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
-from memcomp_lightning.cli import sweep, train, units
-from memcomp_lightning.report import Records
+from memcomp_lightning.cli import sweep, train
+from memcomp_lightning.studies import Records
 
 CURVES = {
     "cd": "['sampler=cd']",
@@ -39,17 +39,17 @@ def test_the_same_command_gives_the_same_figure(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    accuracy = {}
+    found = {}
     for place in ("cpu", device):
         monkeypatch.setattr(sys, "argv", ["memcomp-train", *FIGURE, f"hydra.run.dir={place}"])
         monkeypatch.setattr(sweep.RememberSweepFolder, "folder", None)
-        monkeypatch.setattr(units, "device_of", lambda accelerator, place=place: torch.device(place))
+        monkeypatch.setattr(accuracy, "device_of", lambda accelerator, place=place: torch.device(place))
         GlobalHydra.instance().clear()
         train.main()
-        accuracy[place] = {record.key: record.scores for record in Records(Path(place)).all}
-    assert {key[0] for key in accuracy["cpu"]} >= set(CURVES)
+        found[place] = {record.key: record.scores for record in Records(Path(place)).all}
+    assert {key[0] for key in found["cpu"]} >= set(CURVES)
     if device == stand_in.NAME:
         assert stand_in.waits
-        assert accuracy[device] == accuracy["cpu"]
+        assert found[device] == found["cpu"]
     else:  # its generators draw other numbers
-        assert accuracy[device].keys() == accuracy["cpu"].keys()
+        assert found[device].keys() == found["cpu"].keys()

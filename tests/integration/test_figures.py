@@ -16,7 +16,7 @@ from running import HANGS_AFTER, QUIET, Outcome
 
 from memcomp_lightning.cli import figures, report
 from memcomp_lightning.cli.commands import report as pages
-from memcomp_lightning.report import Records
+from memcomp_lightning.studies import Records
 
 Run = Callable[..., Outcome]
 
@@ -165,7 +165,7 @@ def controls(memcomp_train: Run, no_pages: None, tmp_path_factory: pytest.TempPa
     if not folder.exists():
         curve = "+figure.curves.{0}={{label: {0}, overrides: ['control={0}'], iterations: [{1}]}}"
         curves = [curve.format(*control) for control in CONTROLS.items()]
-        claims = "figure.claims=[{better:none,than:none}]"
+        claims = "figure.claims=[{better:shuffled,than:gaussian}]"
         drop = ["~figure.curves.cd1", "~figure.curves.mem_qubo", claims]
         outcome = memcomp_train(
             "experiment=figure4", *SMALL, NO_CONTROLS, *curves, *drop, f"hydra.run.dir={folder}"

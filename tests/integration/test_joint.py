@@ -20,7 +20,6 @@ from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_part
 from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.report.worth import Courses, weights_path
 from memcomp_lightning.samplers import (
     PCD,
     ClampedGibbs,
@@ -31,6 +30,7 @@ from memcomp_lightning.samplers import (
     ModeSchedule,
 )
 from memcomp_lightning.solvers import BruteForce
+from memcomp_lightning.studies.worth import Courses, weights_path
 from memcomp_lightning.training import Boltzmann, Joint
 
 Run = Callable[..., Outcome]

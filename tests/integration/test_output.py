@@ -26,6 +26,7 @@ from memcomp_lightning.cli.commands import solve as solving
 from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.output import compilation_told, say, tolerant_streams
 from memcomp_lightning.cli.overrides import claimed
+from memcomp_lightning.studies import report as study_report
 
 Run = Callable[..., Outcome]
 SHORT = ["sampler=cd", "pretrain.iterations=1", "finetune.iterations=1", "callbacks=minimal", "logger=none"]
@@ -321,12 +322,12 @@ def test_advice_of_the_report_works_when_pasted(
 
     folder = tmp_path / AWKWARD
     folder.mkdir(parents=True)
-    monkeypatch.setattr(report, "read_results", lambda _: Nothing())
-    monkeypatch.setattr(report, "read_worth", lambda _: Nothing())
+    monkeypatch.setattr(study_report, "read_results", lambda _: Nothing())
+    monkeypatch.setattr(study_report, "read_worth", lambda _: Nothing())
     for name in ("figure.json", "worth.json"):
         (folder / name).touch()
         with pytest.raises(UserError) as refused:
-            report.report(folder)
+            report._section(folder)
         assert shell.arguments(str(refused.value).partition("go on with ")[2]) == [f"resume={folder}"]
 
 

@@ -11,8 +11,8 @@ from running import QUIET, Outcome
 from memcomp_lightning.cli.build import build
 from memcomp_lightning.cli.hydra_versions import INITIALIZE
 from memcomp_lightning.cli.overrides import CONFIG_MODULE
-from memcomp_lightning.cli.units import pretrained
 from memcomp_lightning.modules import Classifier
+from memcomp_lightning.studies.accuracy import pretrained
 from memcomp_lightning.training import finetune
 
 Run = Callable[..., Outcome]

@@ -12,13 +12,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.gradient_bias import gradient
-from memcomp_lightning.cli.worth_measures import mean_gradient
 from memcomp_lightning.data import Digits, ImageDataModule, ShiftingBars
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
 from memcomp_lightning.models import DBN, RBM, Gaussian
-from memcomp_lightning.report.worth import Courses, read_worth, weights_path
 from memcomp_lightning.samplers import Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
 from memcomp_lightning.solvers import BruteForce
+from memcomp_lightning.studies.measures.gradient_bias import mean_gradient
+from memcomp_lightning.studies.worth import Courses, read_worth, weights_path
 
 Run = Callable[..., Outcome]
 KEPT = ("cd1", "cd1_long", "exact", "mode_cd_exact")

@@ -9,10 +9,10 @@ from scipy import stats
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.report import Claim, Plan, Record, Records, Results, markdown, page, verdicts
-from memcomp_lightning.report.comparison import compare
-from memcomp_lightning.report.page import Section
-from memcomp_lightning.report.verdicts import HOLDS, horizontal_arrow, vertical_arrow
+from memcomp_lightning.studies import Claim, FigurePlan, Record, Records, Results, markdown, page, verdicts
+from memcomp_lightning.studies.comparison import compare
+from memcomp_lightning.studies.page import Section
+from memcomp_lightning.studies.verdicts import HOLDS, horizontal_arrow, vertical_arrow
 
 CLAIM = Claim(better="mem", than="cd")
 
@@ -53,7 +53,7 @@ def plan(**settings):
         "stop_early": [],
         "scale": "7 partitions",
     }
-    return Plan(**{**made, **settings})
+    return FigurePlan(**{**made, **settings})
 
 
 def results(tmp_path, *found, **settings):
@@ -204,4 +204,4 @@ def test_plan_refuses_unknown_curves_and_axes():
         plan(claims=[Claim(better="x", than="cd")])
     with pytest.raises(SettingError, match=r"figure\.against = 'epochs'"):
         plan(against="epochs")
-    assert Plan.of(json.loads(json.dumps(asdict(plan())))) == plan()
+    assert FigurePlan.of(json.loads(json.dumps(asdict(plan())))) == plan()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from memcomp_lightning import rng
-from memcomp_lightning.report.verdicts import FAILS, HOLDS
-from memcomp_lightning.report.worth import Course, Worth, holm, worth_table, worth_verdicts
+from memcomp_lightning.studies.verdicts import FAILS, HOLDS
+from memcomp_lightning.studies.worth import Course, Worth, holm, worth_table, worth_verdicts
 
 PLAN = {
     "replicas": 11,

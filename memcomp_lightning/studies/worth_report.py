@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from memcomp_lightning.cli.event_files import event_file
 from memcomp_lightning.files import write_text
-from memcomp_lightning.plotting import plot_worth
-from memcomp_lightning.report import Verdict, markdown
-from memcomp_lightning.report.worth import Worth, worth_table, worth_verdicts
+from memcomp_lightning.studies.event_files import event_file
+from memcomp_lightning.studies.page import markdown
+from memcomp_lightning.studies.plot_worth import plot_worth
+from memcomp_lightning.studies.verdicts import Verdict
+from memcomp_lightning.studies.worth import Worth, worth_table, worth_verdicts
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter

@@ -18,9 +18,9 @@ import torch
 from tqdm import tqdm
 
 from memcomp_lightning import compiling
-from memcomp_lightning.cli.units import Progress, device_of
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.report.records import JsonLines
+from memcomp_lightning.studies.accuracy import Progress, device_of
+from memcomp_lightning.studies.records import JsonLines
 
 
 def _n_cores() -> int:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
 
-from memcomp_lightning.report.verdicts import HOLDS, ONLY, RULE, Verdict
+from memcomp_lightning.studies.verdicts import HOLDS, ONLY, RULE, Verdict
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; color: #222 }

@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from memcomp_lightning.report.comparison import signed
-from memcomp_lightning.report.results import Claim, Results
-from memcomp_lightning.report.verdicts import gains_by_pretraining, horizontal_arrow, vertical_arrow
+from memcomp_lightning.studies.comparison import signed
+from memcomp_lightning.studies.results import Claim, Results
+from memcomp_lightning.studies.verdicts import gains_by_pretraining, horizontal_arrow, vertical_arrow
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "0.25", "0.55")

@@ -1,4 +1,4 @@
-"""One training of ``experiment=sampler_worth``: replicas of one method side by side, measured between passes."""
+"""Trials that are measured by likelihood: replicas of one method side by side, measured between passes."""
 
 import copy
 import math
@@ -9,21 +9,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.cli.build import Plan, Stage, build
-from memcomp_lightning.cli.hydra_versions import instantiate
-from memcomp_lightning.cli.threads import in_one_thread
-from memcomp_lightning.cli.units import Progress
-from memcomp_lightning.cli.worth_measures import gradient_bias, mean_gradient, measure_of, without_diverged
+from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.models import DBM, DBN, stacked
 from memcomp_lightning.modules import EnergyPretraining
-from memcomp_lightning.report.worth import Course, weights_path
 from memcomp_lightning.samplers import positive_phase
+from memcomp_lightning.studies.accuracy import Progress
+from memcomp_lightning.studies.measures import MEASURES
+from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
+from memcomp_lightning.studies.plan import Plan, Stage
+from memcomp_lightning.studies.worth import Course, weights_path
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass, pretrain
 
 
@@ -36,7 +35,8 @@ class Job:
         method: Name of the method.
         rate: Learning rate of the first update.
         folder: Of the run: final weights go there.
-        config: Settings as plain values, those of a single run.
+        settings: Of a single run, as plain values.
+        build: Makes the objects of a run from its settings; a function of a module, which processes can import.
         n_reported: Seeds 0 to n - 1, side by side.
         n_choosing: Further seeds, scored on images that the reported ones do not see where there are such.
         points: Passes after which the RBMs are measured.
@@ -49,7 +49,8 @@ class Job:
     method: str
     rate: float
     folder: str
-    config: dict[str, Any]
+    settings: dict[str, Any]
+    build: Callable[[dict[str, Any]], Plan]
     n_reported: int
     n_choosing: int
     points: tuple[int, ...]
@@ -115,18 +116,14 @@ def run_job(job: Job, progress: Progress) -> list[Course]:
 
 
 def _run_job(job: Job, progress: Progress) -> list[Course]:
-    config = OmegaConf.create(job.config)
-    plans = []
-    for seed in range(job.n_replicas):
-        config.seed = seed
-        plans.append(build(config))
+    plans = [job.build({**job.settings, "seed": seed}) for seed in range(job.n_replicas)]
     stage, module = module_of(plans[0])
     network = side_by_side(plans)
     batches = stage.data.train_batches(0, 1).repeated(range(job.n_replicas))
     _warm_up(model_of(network), module, next(iter(batches)).v)
-    measure, seconds = measure_of(job.measure, stage.data, job.n_reported), 0.0
+    measure, seconds = MEASURES[job.measure](stage.data, job.n_reported), 0.0
     begin, reported = time.process_time(), 0
-    training = _training(job, module, network, batches)
+    training = _training(job, plans[0], network, batches)
     course = Course(job.data_set, job.method, job.rate)
     updates_a_pass = sum(batch.closes_step for batch in batches)
     try:
@@ -160,8 +157,9 @@ def _run_job(job: Job, progress: Progress) -> list[Course]:
     return [course]
 
 
-def _training(job: Job, module: EnergyPretraining, network: Any, batches: Batches) -> Training:
+def _training(job: Job, plan: Plan, network: Any, batches: Batches) -> Training:
     """Layer by layer, or all units at once."""
+    module = module_of(plan)[1]
     settings: dict[str, Any] = {
         "optimizer": module.make_optimizer,
         "schedules": module.schedules,
@@ -171,7 +169,8 @@ def _training(job: Job, module: EnergyPretraining, network: Any, batches: Batche
     if job.greedy_passes:
         for before in pretrain(Greedy(network), batches, module.sampler, iterations=job.greedy_passes, **settings):
             done = before.number
-    stage = instantiate(OmegaConf.create(job.config).pretrain.stage)(network)
+    assert plan.stage_for is not None
+    stage = plan.stage_for(network)
     passes = pretrain(stage, batches, module.sampler, iterations=module.iterations, **settings)
     return Training(
         (after._replace(number=done + after.number) for after in passes),

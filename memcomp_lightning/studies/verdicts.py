@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.report.comparison import Comparison, compare
-from memcomp_lightning.report.results import Claim, Results
+from memcomp_lightning.studies.comparison import Comparison, compare
+from memcomp_lightning.studies.results import Claim, Results
 
 HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from memcomp_lightning.report.worth import Worth
+from memcomp_lightning.studies.worth import Worth
 
 
 def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: float = 4.6) -> Figure:

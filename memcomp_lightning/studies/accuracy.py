@@ -1,4 +1,4 @@
-"""Networks of a figure, and their training side by side."""
+"""Trials that are measured by accuracy: networks of a figure, and their training side by side."""
 
 import json
 import math
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.cli.build import Plan, Stage, build
+from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import DBN, stacked
 from memcomp_lightning.modules import Classifier, EnergyPretraining
-from memcomp_lightning.report import Record
+from memcomp_lightning.studies.plan import Plan, Stage
+from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError, evaluate, finetune, pretrain
 from memcomp_lightning.types import Batch
 
@@ -29,7 +29,8 @@ class Member:
 
     Attributes:
         curve: Name of the curve.
-        config: Settings as plain values.
+        settings: Of the run, as plain values.
+        build: Makes the objects of a run from its settings; a function of a module, which processes can import.
         iterations: Of pretraining.
         seed: Of weights, chains and order.
         choice: Value of the setting that is being chosen, or has been.
@@ -37,7 +38,8 @@ class Member:
     """
 
     curve: str
-    config: dict[str, Any]
+    settings: dict[str, Any]
+    build: Callable[[dict[str, Any]], Plan]
     iterations: int
     seed: int
     choice: float | None
@@ -46,9 +48,9 @@ class Member:
     @property
     def fine_tuning(self) -> str:
         """What networks must share to be fine-tuned as one program."""
-        config = self.config
-        shared = {name: config[name] for name in ("data", "finetune", "trainer")}
-        shared["network"] = [config["model"]["_target_"], config["model"]["hidden_sizes"]]
+        settings = self.settings
+        shared = {name: settings[name] for name in ("data", "finetune", "trainer")}
+        shared["network"] = [settings["model"]["_target_"], settings["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)
 
 
@@ -74,12 +76,50 @@ class Unit:
         return f"{first.curve}, {what}" + (f" and {more} more" if more else "")
 
 
+_IN_CACHE = 40
+"""Small networks that one CPU core trains fastest side by side: more of them no longer fit into its cache."""
+
+
+def grouped(members: Sequence[Member], passes: tuple[int, ...], *, networks: int | None) -> list[Unit]:
+    """Put members together that can be fine-tuned as one program; the longest programs come first.
+
+    Args:
+        members: Networks to train.
+        passes: Fine-tuning passes after which they are tested.
+        networks: Replicas in a program, about; None is what a CPU core or a GPU trains fastest.
+    """
+    groups: dict[str, list[Member]] = {}
+    for member in members:
+        groups.setdefault(member.fine_tuning, []).append(member)
+    units = []
+    for alike in groups.values():
+        data = tuning(plan_of(alike[0], passes[-1])).data
+        n_replicas = math.prod(data.replicas)
+        each = len(data.train_batches(0, 1)) * n_replicas * passes[-1]
+        size = _n_members(alike[0], len(alike), n_replicas, networks)
+        for start in range(0, len(alike), size):
+            some = tuple(alike[start : start + size])
+            units.append(Unit(some, passes, each * len(some)))
+    # So that no process is left alone with a long one at the end.
+    return sorted(units, key=lambda unit: -unit.n_updates)
+
+
+def _n_members(member: Member, n_all: int, n_replicas: int, networks: int | None) -> int:
+    """How many members train as one program: replicas are what counts, in programs of about one size."""
+    if networks is None:
+        networks = 10_000 if device_of(member.settings["trainer"]["accelerator"]).type != "cpu" else _IN_CACHE
+    require_count("figure.networks", networks)
+    most = max(1, int(networks // n_replicas))
+    return math.ceil(n_all / math.ceil(n_all / most))
+
+
 def plan_of(member: Member, n_passes: int) -> Plan:
     """The stages of a member, as the command line would build them for it alone."""
-    config = OmegaConf.create(member.config)
-    config.pretrain.iterations, config.seed = member.iterations, member.seed
-    config.finetune.iterations = n_passes
-    return build(config)
+    settings = dict(member.settings)
+    settings["seed"] = member.seed
+    settings["pretrain"] = {**settings["pretrain"], "iterations": member.iterations}
+    settings["finetune"] = {**settings["finetune"], "iterations": n_passes}
+    return member.build(settings)
 
 
 def run_unit(unit: Unit, progress: Progress) -> list[Record]:
@@ -90,7 +130,7 @@ def run_unit(unit: Unit, progress: Progress) -> list[Record]:
     Raises:
         DivergedError: Naming the curve.
     """
-    device = device_of(unit.members[0].config["trainer"]["accelerator"])
+    device = device_of(unit.members[0].settings["trainer"]["accelerator"])
     members, plans, pretrain_s, found = [], [], [], []
     for number, member in enumerate(unit.members):
         progress(f"{unit.title}, pretraining {number + 1} of {len(unit.members)}", 0)
@@ -135,7 +175,7 @@ def _fine_tuned(
     scores: dict[str, list[Tensor]] = {f"{name}_{what}": [] for name in images for what in ("accuracy", "loss")}
     n_updates = len(batches) * n_members * math.prod(replicas)
     # Where several passes are tested, the best of these is found by the report.
-    keeps_best = members[0].config["finetune"]["keep_best"] and len(unit.passes) == 1
+    keeps_best = members[0].settings["finetune"]["keep_best"] and len(unit.passes) == 1
     try:
         for done in finetune(
             network,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require_choice
-from memcomp_lightning.report.records import Records
+from memcomp_lightning.studies.records import Records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class FigurePlan:
     """What a figure shows.
 
     Attributes:
@@ -86,7 +86,7 @@ class Plan:
                 require_choice("controls of figure.claims", curve, tuple(self.labels))
 
     @classmethod
-    def of(cls, settings: Mapping[str, Any]) -> "Plan":
+    def of(cls, settings: Mapping[str, Any]) -> "FigurePlan":
         """From the plain values of ``figure.json``."""
         return cls(**{**settings, "claims": [Claim(**claim) for claim in settings["claims"]]})
 
@@ -106,7 +106,7 @@ class Plan:
 class Results:
     """Accuracies of a figure by curve, pretraining iterations, pass, and pair of seed and partition."""
 
-    def __init__(self, plan: Plan, records: Records) -> None:
+    def __init__(self, plan: FigurePlan, records: Records) -> None:
         self.plan = plan
         self.chosen: dict[str, float | None] = {curve: records.best_choice(curve) for curve in plan.labels}
         self._values: dict[str, dict[int, dict[int, NDArray[np.float64]]]] = {}
@@ -176,4 +176,4 @@ def read_results(folder: Path) -> Results:
         raise FileNotFoundError(
             f"{folder} holds no figure.json: name the folder of a run like memcomp-train experiment=figure4."
         )
-    return Results(Plan.of(json.loads(path.read_text(encoding="utf-8"))), Records(folder))
+    return Results(FigurePlan.of(json.loads(path.read_text(encoding="utf-8"))), Records(folder))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from memcomp_lightning.report.records import JsonLines
-from memcomp_lightning.report.verdicts import FAILS, HOLDS, Verdict
+from memcomp_lightning.studies.records import JsonLines
+from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,43 @@
+"""Log-likelihood by annealed importance sampling in both directions."""
+
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.likelihood import Ais, ReverseAis, base_of, base_on_first_class
+from memcomp_lightning.models import RBM, EnergyModel, as_two_layers
+from memcomp_lightning.models.chains import sweep
+from memcomp_lightning.studies.measures.base import Measure, Scores, negative_log_likelihood
+
+FANTASY_SWEEPS = 200
+"""Gibbs sweeps from training images to the samples from which reverse AIS starts."""
+
+
+def ais(data: Any, n_reported: int) -> Measure:
+    """AIS reports too small a partition function and reverse AIS too large a one: they bracket the score."""
+    negative, v = negative_log_likelihood(data, n_reported), data.images.train_v
+    base, annealing = base_of(v), Ais()
+
+    def measure(rbm: RBM) -> Scores:
+        up = annealing.estimate(rbm, generator=rng.stream(0, "ais"), base=base)
+        start, generator = v[: annealing.n_chains].expand(*rbm.replicas, -1, -1), rng.stream(0, "fantasies")
+        two_layers, base_of_two, samples = _of_two_layers(rbm, base, start, generator)
+        for _ in range(FANTASY_SWEEPS):
+            samples = sweep(two_layers, samples, generator=generator)
+        down = ReverseAis().estimate(two_layers, samples, generator=rng.stream(0, "reverse ais"), base=base_of_two)
+        return Scores(negative(rbm, up.log_z), negative(rbm, down.log_z))
+
+    return measure
+
+
+def _of_two_layers(
+    model: EnergyModel, base: Tensor, v: Tensor, generator: Generator
+) -> tuple[RBM, Tensor, Tensor]:
+    """An RBM, its base and where its chains start; a DBM is the RBM between its odd and its even layers."""
+    layers = as_two_layers(model)
+    if layers.units is None:
+        return layers.rbm, base, v
+    x = torch.cat((v, rng.bernoulli(model.hidden_mean(v), generator=generator)), dim=-1)
+    return layers.rbm, base_on_first_class(model, base), layers.first(x)

@@ -1,0 +1,52 @@
+"""A run as objects: its network, and the stages that train it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import lightning.pytorch as pl
+from torch import nn
+
+from memcomp_lightning.data import ImageDataModule
+from memcomp_lightning.models import Randomiser
+from memcomp_lightning.modules import StageModule
+from memcomp_lightning.training import PretrainingStage
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One fit.
+
+    Attributes:
+        module: What is trained.
+        data: Its images.
+        callbacks: What looks at it under a trainer.
+    """
+
+    module: StageModule
+    data: ImageDataModule
+    callbacks: list[pl.Callback]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All that a run needs.
+
+    Attributes:
+        network: What is trained; the stages share it.
+        pretraining: The first stage, None for a network without pretraining.
+        finetuning: The last stage, None if left out.
+        between: Changes the network after its pretraining, None if nothing does.
+        stage_for: The way of pretraining for another network of the same kind; None without pretraining.
+    """
+
+    network: nn.Module
+    pretraining: Stage | None
+    finetuning: Stage | None
+    between: Randomiser | None = None
+    stage_for: Callable[[Any], PretrainingStage] | None = None
+
+    @property
+    def stages(self) -> list[Stage]:
+        """The stages in order."""
+        return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
