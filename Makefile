@@ -31,8 +31,9 @@ lint-but-types: $(VENV)/.installed-dev
 types: $(VENV)/.installed-dev
 	$(BIN)/mypy
 
-# A thread a worker.
+# A thread a worker; what one process has compiled, the others read.
 unit-and-exact whole-suite: export OMP_NUM_THREADS = 1
+unit-and-exact whole-suite: export PYTHONDONTWRITEBYTECODE =
 unit-and-exact: $(VENV)/.installed-dev
 	$(BIN)/pytest tests/exact tests/unit
 

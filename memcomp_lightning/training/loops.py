@@ -85,6 +85,7 @@ def pretrain(
     device = next(stage.network.parameters()).device
     streams = {name: rng.stream(seed, name, device=device) for name in ("negative_phase", "positive_phase")}
     for number, phase in enumerate(stage.phases):
+        model = cast(nn.Module, phase.model).to(device)  # it need not be a part of the network
         training = PhaseTraining(
             phase, sampler, optimizer=optimizer, schedules=schedules, centring=centring, streams=streams
         )
@@ -93,7 +94,7 @@ def pretrain(
             done = training.run_pass(batches)
             stage.hand_over()
             yield done._replace(number=epoch + 1)
-        require_finite(cast(nn.Module, phase.model), f"pretraining, {phase.name}")
+        require_finite(model, f"pretraining, {phase.name}")
 
 
 class PhaseTraining:

@@ -9,7 +9,7 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 
 from memcomp_lightning.cli import sweep, train
-from memcomp_lightning.studies import Records
+from memcomp_lightning.studies import Records, accuracy
 
 CURVES = {
     "cd": "['sampler=cd']",
