@@ -4,6 +4,10 @@ from collections.abc import Collection
 from numbers import Integral
 
 
+class UserError(Exception):
+    """Something that the user can put right; the message says how."""
+
+
 class SettingError(ValueError):
     """A setting that does not exist or is out of range, met at construction."""
 

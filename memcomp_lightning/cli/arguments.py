@@ -17,7 +17,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.completion_plugin import CompletionPlugin
 
-from memcomp_lightning.cli.errors import UserError
+from memcomp_lightning.errors import UserError
 
 SHOWING = ("help", "hydra_help", "cfg", "info", "shell_completion")
 """Flags that show something and run nothing; the settings are checked all the same."""

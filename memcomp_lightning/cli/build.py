@@ -17,12 +17,12 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
-from memcomp_lightning.cli.errors import UserError, in_words
+from memcomp_lightning.cli.errors import in_words
 from memcomp_lightning.cli.hydra_versions import instantiate
 from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.overrides import check_finite, check_seed
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
-from memcomp_lightning.errors import require, require_choice, require_count, require_parts
+from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, BoltzmannMachine, start_at_means
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
 from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of

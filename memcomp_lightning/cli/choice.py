@@ -9,10 +9,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.cli.build import plan_of
-from memcomp_lightning.cli.errors import UserError
-from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.files import write_text
+from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
 
 HELD_OUT = 0.1

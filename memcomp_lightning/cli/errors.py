@@ -12,11 +12,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from yaml import YAMLError
 
 from memcomp_lightning.cli.output import say
-
-
-class UserError(Exception):
-    """Something that the user can put right; the message says how."""
-
+from memcomp_lightning.errors import UserError
 
 CONFIGURATION_ERRORS = (
     UserError,

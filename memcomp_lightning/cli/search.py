@@ -11,8 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.cli.errors import UserError
-from memcomp_lightning.errors import require
+from memcomp_lightning.errors import UserError, require
 
 
 def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[list[str]], bool, str | None]:

@@ -9,8 +9,9 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import (
+from memcomp_lightning.files import write_text
+from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.table import (
     LIKELIHOOD_TITLE,
     aligned,
     final_log_likelihoods,
@@ -19,7 +20,6 @@ from memcomp_lightning.cli.table import (
     with_error,
     without_empty_columns,
 )
-from memcomp_lightning.files import write_text
 
 
 class RememberSweepFolder(Callback):

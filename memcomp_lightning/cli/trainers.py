@@ -14,12 +14,12 @@ from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.callbacks import BestWeights
-from memcomp_lightning.cli.errors import UserError, explain
+from memcomp_lightning.cli.errors import explain
 from memcomp_lightning.cli.hydra_versions import instantiate
-from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.modules.trainers import NOT_WITH_STAGES, check_trainer, tries
 from memcomp_lightning.modules.weights import AtomicCheckpointIO
+from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.studies.plan import Plan, Stage
 
 _BY_THE_STAGE = "nothing, each stage sets it"

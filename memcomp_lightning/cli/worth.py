@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.build import build, check_without_trainer, plan_of
-from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.figures import composed_for
 from memcomp_lightning.cli.overrides import check_entry, check_not_given
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import UserError, require, require_choice, require_count
 from memcomp_lightning.files import write_text
 from memcomp_lightning.studies.likelihood import Job, model_of, module_of, run_job, side_by_side
 from memcomp_lightning.studies.measures import MEASURES

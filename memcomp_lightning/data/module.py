@@ -99,6 +99,11 @@ class ImageDataModule(LightningDataModule):
         return None if self._held_out[0] is self.images.test_v else self._held_out
 
     @property
+    def n_at_once(self) -> int:
+        """Training images of a replica that are computed together: of an update, or of a chunk of it."""
+        return min(self.n_train, self._batch_size or self.n_train, self._chunk_size)
+
+    @property
     def n_visible(self) -> int:
         """Number of visible units."""
         return self.images.n_visible

@@ -18,7 +18,7 @@ pre, small { color: #555 }
 """
 
 
-_HEADER = ("claim of the paper", "measured", "difference", "verdict", "controls that explain it")
+_HEADER = ("claim", "measured", "difference", "verdict", "controls that explain it")
 
 
 class Section(NamedTuple):

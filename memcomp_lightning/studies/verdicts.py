@@ -13,8 +13,8 @@ HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
 RULE = (
     "A claim holds if the paired difference is positive with p < .05 (two-sided t test over partitions and "
     "seeds). It holds only without a control if that control accounts for more than half of the gain: the upper "
-    "end of the 95 % interval of Mem-QUBO less the control lies below half of it. Fewer iterations are judged "
-    "where the other method gains by its own (p < .05)."
+    "end of the 95 % interval of the better curve less the control lies below half of it. Fewer iterations are "
+    "judged where the other method gains by its own (p < .05)."
 )
 
 

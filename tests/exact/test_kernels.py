@@ -9,14 +9,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 
 from memcomp_lightning import rng
+from memcomp_lightning.likelihood import kernel as likelihood_kernel
 from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.solvers import Status
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
-from memcomp_lightning.solvers.dmm.kernels import cpu, lanes, reference
+from memcomp_lightning.solvers.dmm.kernels import common, cpu, lanes, prepare, reference, rows
 from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
+from memcomp_lightning.solvers.kernels import branch_and_bound
 
 # Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
 SLOW = Splitting(change=0.3, dt_min=0.01, dt_max=0.4, lag=0.2)
@@ -620,3 +623,28 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
     )
     cpu._forget_outdated.__wrapped__(kernel)
     assert {path.name for path in tmp_path.iterdir()} == {"lanes.gone.nbi", "lanes.new.nbi"}
+
+
+# --- the same code in every process ------------------------------------------------------------------------
+
+
+ENTRIES = {"rows.integrate_all", "lanes.integrate_all", "prepare.prepare", "branch_and_bound.search"}
+ENTRIES |= {"kernel.sum_over_second"}
+
+
+COMPILED = [common, rows, lanes, prepare, branch_and_bound, likelihood_kernel]
+
+
+@pytest.mark.parametrize("module", COMPILED, ids=lambda module: module.__name__)
+def test_what_a_kernel_calls_becomes_a_part_of_it(module):
+    """Else the process that compiles it runs other machine code than those that load it, with other last bits.
+
+    There the linker finds two copies of a called function, of which one was optimised alone.
+    """
+    functions = {name: part for name, part in vars(module).items() if isinstance(part, Dispatcher)}
+    own = {name: part for name, part in functions.items() if part.__module__ == module.__name__}
+    assert own
+    for name, function in own.items():
+        if f"{module.__name__.rpartition('.')[2]}.{name}" not in ENTRIES:
+            options = function.targetoptions
+            assert options.get("forceinline") or options.get("inline") == "always", name

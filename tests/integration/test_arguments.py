@@ -15,9 +15,9 @@ import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.cli import arguments
 from memcomp_lightning.cli.arguments import from_folder, read, with_path
-from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.hydra_versions import INITIALIZE
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, _check_options
+from memcomp_lightning.errors import UserError
 
 Run = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"

@@ -20,12 +20,13 @@ from numba import njit
 from running import Outcome
 
 from memcomp_lightning import compiling
-from memcomp_lightning.cli import pipeline, trainers
+from memcomp_lightning.cli import trainers
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
-from memcomp_lightning.cli.errors import UserError
 from memcomp_lightning.cli.output import compilation_told, say, tolerant_streams
 from memcomp_lightning.cli.overrides import claimed
+from memcomp_lightning.errors import UserError
+from memcomp_lightning.runs import pipeline
 from memcomp_lightning.studies import report as study_report
 
 Run = Callable[..., Outcome]

@@ -4,11 +4,12 @@ import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from running import FAST, Outcome
 
-from memcomp_lightning.cli import pipeline
+from memcomp_lightning.runs import pipeline
 
 Run = Callable[..., Outcome]
 SWEEP = ["-m", "sampler=cd,pcd", "seed=0,1,2", *FAST, "hydra.sweep.dir=sweep"]
@@ -38,13 +39,11 @@ def test_failing_job_leaves_the_others_and_is_repeated_alone(
     trained: list[str] = []
     original = pipeline.run
 
-    def sometimes(
-        plan: object, config: object, folder: object, overrides: dict[str, str], choice: object
-    ) -> dict[str, object]:
+    def sometimes(*arguments: Any, overrides: dict[str, str], **settings: Any) -> dict[str, Any]:
         trained.append(overrides["seed"])
         if broken and overrides["seed"] == "1" and overrides["sampler"] == "cd":
             raise RuntimeError("the disk caught fire")
-        return original(plan, config, folder, overrides, choice)
+        return original(*arguments, overrides=overrides, **settings)
 
     monkeypatch.setattr(pipeline, "run", sometimes)
     broken = True

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from memcomp_lightning.cli.arguments import as_typed
-from memcomp_lightning.cli.errors import UserError, in_words, refuse
+from memcomp_lightning.cli.errors import in_words, refuse
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.table import aligned, short_path
-from memcomp_lightning.errors import SettingError
+from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import write_text
+from memcomp_lightning.runs.table import aligned, short_path
 from memcomp_lightning.studies.page import Section, page
 from memcomp_lightning.studies.report import NothingMeasuredError, write_report
 from memcomp_lightning.studies.verdicts import Verdict

@@ -15,13 +15,12 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli.arguments import read
-from memcomp_lightning.cli.errors import UserError, refuse
+from memcomp_lightning.cli.errors import refuse
 from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
 from memcomp_lightning.cli.kinds import check_kinds
 from memcomp_lightning.cli.output import make_tolerant, say
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, check_finite, check_seed
-from memcomp_lightning.cli.table import short_path
-from memcomp_lightning.errors import SettingError, require, require_choice
+from memcomp_lightning.errors import SettingError, UserError, require, require_choice
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import (
@@ -35,6 +34,7 @@ from memcomp_lightning.problems import (
     read_problem,
     to_qubo,
 )
+from memcomp_lightning.runs.table import short_path
 from memcomp_lightning.solvers import (
     Answer,
     BranchAndBound,

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -15,21 +16,22 @@ from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import figures, pipeline, sweep, trajectory, worth
+from memcomp_lightning.cli import figures, sweep, trajectory, worth
 from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
 from memcomp_lightning.cli.build import build, check_without_trainer
 from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.commands import report
-from memcomp_lightning.cli.errors import UserError, explain, in_words, refuse
-from memcomp_lightning.cli.hydra_versions import MAIN
+from memcomp_lightning.cli.errors import explain, in_words, refuse
+from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
 from memcomp_lightning.cli.output import make_tolerant, say
 from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, search_path
-from memcomp_lightning.cli.run_folder import RunFolder
 from memcomp_lightning.cli.search import check_searchable
-from memcomp_lightning.cli.table import closing_lines, run_table, short_path
-from memcomp_lightning.cli.trainers import check_trainers
-from memcomp_lightning.errors import SettingError, require, require_count
+from memcomp_lightning.cli.trainers import check_trainers, trainer_of
+from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError
+from memcomp_lightning.runs import pipeline
+from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.table import closing_lines, run_table, short_path
 from memcomp_lightning.training import DivergedError
 
 COMMAND = "memcomp-train"
@@ -101,7 +103,18 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
     if result is None:
         try:
             config, choice = settle(config, folder)
-            result = pipeline.run(build(config), config, folder, _by_name(overrides), choice)
+            loggers = [instantiate(logger) for logger in config.logger.values() if logger is not None]
+            by_name = _by_name(overrides)
+            result = pipeline.run(
+                build(config),
+                folder,
+                make_trainer=lambda stage: trainer_of(stage, config, folder, loggers),
+                loggers=loggers,
+                settings=_distinguishing_settings(config, by_name),
+                overrides=by_name,
+                seed=config.seed,
+                choice=choice,
+            )
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
             raise KeyboardInterrupt(_go_on(folder)) from stop
     else:
@@ -233,3 +246,11 @@ def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+
+
+def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, Any]:
+    """What tells runs of a sweep apart: TensorBoard shows the first five, and more where more was overridden."""
+    choices = HydraConfig.get().runtime.choices
+    settings: dict[str, Any] = {group: choices[group] for group in ("data", "model", "sampler")}
+    settings |= {"seed": config.seed, "pretrain.iterations": config.pretrain.iterations}
+    return {**settings, **{name: value for name, value in overrides.items() if name not in settings}}

@@ -72,7 +72,7 @@ def clause(weight, voltage, false_second, short, long, rates):
     return short, long, first, second
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def keep_if_new(x, best):
     """Copy a state; return whether it differs."""
     new = False
@@ -82,7 +82,7 @@ def keep_if_new(x, best):
     return new
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def copy(source, target):
     """Copy numbers one by one: an assignment of slices takes seconds to compile, for the words of its error."""
     for i in range(source.size):

@@ -31,7 +31,7 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
 U64 = np.uint64
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
     """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive to ``rate``.
 
@@ -56,7 +56,7 @@ def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
             r[b + k] += push[lanes + k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
     """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
 
@@ -91,7 +91,7 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
             r[pull_b + k] += push[k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
     """The same for clauses of three literals and more, padded with polarity 0; the last arrays are scratch."""
     zero, half, one = F32(0), F32(0.5), F32(1)
@@ -136,7 +136,7 @@ def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
                     r[a + k] += q * (at_first if at[k] == number else gradient[k] * smallest[k])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def clause_units(unit, long, voltage, rate, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
@@ -151,7 +151,7 @@ def clause_units(unit, long, voltage, rate, c, dt):
             rate[i, 0, k] += strength * u * (one + long[i, k])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def bond_fields(field, short, long, voltage, rate, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
@@ -170,7 +170,7 @@ def bond_fields(field, short, long, voltage, rate, c, dt):
             rate[i, 0, k] = alpha * (rate[i, 0, k] + h) - pull_rate * pull * voltage[i, k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def flip(digital, x, field, true, i):
     """Flip variable ``i`` of one restart; return the change of energy.
 
@@ -204,7 +204,7 @@ def flip(digital, x, field, true, i):
     return gain
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def local_fields(digital, linear, pairs, x, field, true):
     """Write the local fields of one restart from scratch; return its energy."""
     coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
@@ -233,7 +233,7 @@ def local_fields(digital, linear, pairs, x, field, true):
     return energy
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def quench(digital, x, field, true):
     """Flip single variables of one restart as long as each flip lowers the energy; return the change."""
     one, two, total = F32(1), F32(2), 0.0
@@ -250,7 +250,7 @@ def quench(digital, x, field, true):
     return total
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def read_out(digital, signs, x, field, true, found):
     """Bring one restart up to its voltages' signs; return the change of energy and how many bits changed."""
     change, n_found = 0.0, U64(0)
@@ -262,7 +262,7 @@ def read_out(digital, signs, x, field, true, found):
     return change, n_found
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def transpose_signs(voltage, signs):
     """Write 1 for TRUE and 0 for FALSE, restart by restart, from voltages with the restarts last."""
     n, lanes = voltage.shape
@@ -327,7 +327,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         copy(ended, last[p, b])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def integrate(problem, digital, linear, c, control, start, steps, stop, best, times, states):
     """Integrate the lanes of a block; return the step at which each one's ``best`` was met, and its last step.
 

@@ -81,13 +81,13 @@ def prepare(kind, width, height, coupling, linear, weight, unit, scalars, digita
                 weight[p, i * width + j] = w if kind == BOND else -_way(i, j, n_second, n_first) * w
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _way(i, j, n_second, n_first):
     """``Bipartite.alternating``."""
     return 1.0 if (2 * i >= n_second) == (2 * j >= n_first) else -1.0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _unit_clauses(coupling, linear, unit):
     """The unit clauses of ``qubo.from_qubo``."""
     n_second, n_first = coupling.shape
@@ -101,7 +101,7 @@ def _unit_clauses(coupling, linear, unit):
             unit[n_first + i] -= size * second * (1 + first) / 2
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def _divide(matrix, values, divisor):
     for i in range(values.size):
         values[i] /= divisor
@@ -110,7 +110,7 @@ def _divide(matrix, values, divisor):
             matrix[i, j] /= divisor
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _largest(values):
     largest = 0.0
     for value in values:
@@ -118,7 +118,7 @@ def _largest(values):
     return largest
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _add_both(matrix, sums):
     """Column sums, then row sums."""
     n_second, n_first = matrix.shape
@@ -129,7 +129,7 @@ def _add_both(matrix, sums):
             sums[n_first + i] += matrix[i, j]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _mean_of_used(sums):
     """Mean over the variables that are coupled."""
     total, n_used = 0.0, 0
@@ -139,7 +139,7 @@ def _mean_of_used(sums):
     return total / max(n_used, 1)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def _effective_degree(matrix, power):
     """``scaling.effective_degree``."""
     size, total, n_used = np.empty_like(power), 0.0, 0
@@ -151,12 +151,12 @@ def _effective_degree(matrix, power):
     return max(total / max(n_used, 1), 1.0)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def _or_one(scale):
     return scale if scale > SMALLEST_RATIO else 1.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", forceinline=True)
 def _collective_mode(coupling):
     """``scaling.collective_mode``."""
     n_second, n_first = coupling.shape

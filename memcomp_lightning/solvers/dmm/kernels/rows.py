@@ -30,7 +30,7 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
 U64 = np.uint64
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c, dt):
     """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive.
 
@@ -55,7 +55,7 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def clause_units(unit, long, voltage, drive, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
@@ -69,7 +69,7 @@ def clause_units(unit, long, voltage, drive, c, dt):
         drive[i] += pull * u * (one + long[i])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt):
     """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
 
@@ -115,7 +115,7 @@ def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt)
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def bond_fields(field, short, long, voltage, drive, pull, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
@@ -130,7 +130,7 @@ def bond_fields(field, short, long, voltage, drive, pull, c, dt):
         drive[i] = alpha * (drive[i] + h) - pull_rate * (pull[i] + abs(h) * short[i]) * voltage[i]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
     """Write x_s(0) + epsilon = C(0) + epsilon."""
     half, row = F32(0.5), U64(0)
@@ -144,7 +144,7 @@ def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def flip(n_first, n_second, coupling, transposed, x, field, i):
     """Flip one variable; return the change of energy."""
     change = F32(1) - F32(2) * x[i]
@@ -161,7 +161,7 @@ def flip(n_first, n_second, coupling, transposed, x, field, i):
     return gain
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def local_fields(n_first, n_second, coupling, linear, x, field):
     """Write the local fields of a digital state from scratch; return its energy."""
     energy, row = 0.0, U64(0)
@@ -179,7 +179,7 @@ def local_fields(n_first, n_second, coupling, linear, x, field):
     return energy
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def quench(n_first, n_second, coupling, transposed, x, field, found):
     """Flip single variables, layer by layer, as long as each flip lowers the energy; return the change.
 
@@ -205,7 +205,7 @@ def quench(n_first, n_second, coupling, transposed, x, field, found):
     return total
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def read_out(n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found):
     """Bring the digital state and its fields up to the voltages; return its energy and how many bits changed."""
     half, n, n_changed = F32(0.5), n_first + n_second, 0
@@ -281,7 +281,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         )
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, best, times, states):
     """Integrate one restart; return the step at which ``best`` was met, and the last step.
 

@@ -1,29 +1,27 @@
 """The stages of one run, each picked up where it was left."""
 
 import logging
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
-from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig
 from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
-from memcomp_lightning.cli.errors import UserError, explain
-from memcomp_lightning.cli.hydra_versions import instantiate
-from memcomp_lightning.cli.run_folder import RunFolder
-from memcomp_lightning.cli.table import final_log_likelihoods
-from memcomp_lightning.cli.threads import threads_for
-from memcomp_lightning.cli.trainers import trainer_of
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
+from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
+from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint
+from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.table import final_log_likelihoods
+from memcomp_lightning.runs.threads import threads_for
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
 
@@ -32,37 +30,53 @@ log = logging.getLogger(__name__)
 
 def run(
     plan: Plan,
-    config: DictConfig,
     folder: RunFolder,
-    overrides: dict[str, str],
+    *,
+    make_trainer: Callable[[Stage], pl.Trainer],
+    loggers: Sequence[Logger] = (),
+    settings: Mapping[str, Any],
+    overrides: Mapping[str, str],
+    seed: int,
     choice: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Train what is not trained yet, evaluate, and return the result.
 
     Every stage that is done left its weights; an interrupted one goes on from its last checkpoint.
+
+    Args:
+        plan: Network and stages.
+        folder: Where everything is kept.
+        make_trainer: Makes the trainer of a stage.
+        loggers: Those of the trainers: they get the final numbers.
+        settings: What tells the run from others of a sweep, for TensorBoard.
+        overrides: What was typed, by name, for the result.
+        seed: Of the run.
+        choice: What held-out images chose before the run.
+
+    Raises:
+        UserError: A stage cannot be trained to its end so.
     """
-    loggers: list[Logger] = [instantiate(logger) for logger in config.logger.values() if logger is not None]
     done = folder.finished_stages
     records: dict[str, Any] = {}
-    is_global_zero = True
+    is_global_zero, only_tries = True, False
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
             if stage is plan.pretraining:
-                _between(plan, config)
+                _between(plan, seed)
             continue
-        with threads_for(stage, config):
-            trainer = _fit(stage, config, folder, loggers)
-        is_global_zero = trainer.is_global_zero
+        with threads_for(stage):
+            trainer = _fit(stage, make_trainer(stage), folder)
+        is_global_zero, only_tries = trainer.is_global_zero, tries(trainer)
         records[name] = _record(stage)
-        if is_global_zero and not config.trainer.fast_dev_run:
+        if is_global_zero and not only_tries:
             save_weights(stage.module.network, folder.weights(name))
             folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
-            _between(plan, config)
-    result: dict[str, Any] = {"overrides": dict(overrides), "seed": config.seed, "stages": records}
+            _between(plan, seed)
+    result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
     if choice is not None:
         result["choice"] = choice
     if plan.finetuning is not None:
@@ -74,22 +88,21 @@ def run(
         if plan.finetuning.data.validation is not None:
             held_out = evaluate(module.network, plan.finetuning.data.val_dataloader(), module.loss)
             result["validation_accuracy"] = _numbers(held_out.accuracy)
-    if is_global_zero and not config.trainer.fast_dev_run:
+    if is_global_zero and not only_tries:
         result["context"] = _context(plan, result)
-        _log_final(loggers, config, result)
+        _log_final(loggers, settings, result)
         folder.finish(result)
     return result
 
 
-def _between(plan: Plan, config: DictConfig) -> None:
+def _between(plan: Plan, seed: int) -> None:
     """What is done to the pretrained network before it is fine-tuned, the same when a run is resumed."""
     if plan.between is not None and isinstance(plan.network, DBN):
-        plan.between(plan.network, generator=rng.stream(config.seed, "between stages"))
+        plan.between(plan.network, generator=rng.stream(seed, "between stages"))
 
 
-def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
+def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:
     path = folder.checkpoint(stage.module.stage)
-    trainer = trainer_of(stage, config, folder, loggers)
     resume_from = None
     if path.exists():
         check_checkpoint(stage.module, path)
@@ -100,20 +113,21 @@ def _fit(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logg
     except (NotTrainedError, TrainingSpikeException) as error:
         raise UserError(f"{stage.module.progress}: {error}") from error
     except MisconfigurationException as error:
-        raise UserError(f"{stage.module.stage}: {explain(error)}") from error
+        raise UserError(f"{stage.module.stage}: {error}") from error
     except RuntimeError as error:
         if not str(error).startswith("Early stopping conditioned on metric"):
             raise
         raise UserError(f"callbacks.{stage.module.stage}: {error}") from error
-    _check_trained(stage, config)
+    if not tries(trainer):
+        _check_trained(stage)
     return trainer
 
 
-def _check_trained(stage: Stage, config: DictConfig) -> None:
+def _check_trained(stage: Stage) -> None:
     """Whatever stopped the stage, each of its models has been trained."""
     passes, module = stage.module.passes, stage.module
     n_models = len(module.phases) if isinstance(module, EnergyPretraining) else 1
-    if not config.trainer.fast_dev_run and (len(passes) < n_models or min(passes) == 0):
+    if len(passes) < n_models or min(passes) == 0:
         raise UserError(
             f"{module.stage} ended after {' and '.join(map(str, passes))} passes, before all of its "
             f"{n_models} models were trained: its weights are not recorded. Leave out the callback that ended it."
@@ -152,7 +166,7 @@ def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     return context
 
 
-def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]) -> None:
+def _log_final(loggers: Sequence[Logger], settings: Mapping[str, Any], result: dict[str, Any]) -> None:
     """The final numbers, beside the settings in TensorBoard's HParams tab."""
     metrics: dict[str, float] = {}
     if "test_accuracy" in result:
@@ -163,17 +177,9 @@ def _log_final(loggers: list[Logger], config: DictConfig, result: dict[str, Any]
         if value:  # none where nothing measures it
             metrics[f"final/log_likelihood_layer{layer}"] = sum(value) / len(value)
     metrics["final/wall_time_s"] = sum(record["wall_time_s"] for record in result["stages"].values())
-    write_hyper_parameters(loggers, _distinguishing_settings(config, result["overrides"]), metrics)
+    write_hyper_parameters(list(loggers), dict(settings), metrics)
     for logger in loggers:
         logger.finalize("success")
-
-
-def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, Any]:
-    """What tells runs of a sweep apart: TensorBoard shows the first five, and more where more was overridden."""
-    choices = HydraConfig.get().runtime.choices
-    settings: dict[str, Any] = {group: choices[group] for group in ("data", "model", "sampler")}
-    settings |= {"seed": config.seed, "pretrain.iterations": config.pretrain.iterations}
-    return {**settings, **{name: value for name, value in overrides.items() if name not in settings}}
 
 
 def _numbers(values: Tensor) -> list[float]:

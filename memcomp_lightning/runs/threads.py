@@ -4,8 +4,6 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
-from omegaconf import DictConfig
-
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.studies.plan import Stage
 
@@ -14,19 +12,13 @@ WORTH_THREADS = 2**22
 
 
 @contextmanager
-def threads_for(stage: Stage, config: DictConfig) -> Iterator[None]:
+def threads_for(stage: Stage) -> Iterator[None]:
     """Compute small updates in one thread, as fast as in several.
 
     Others would wait for work by spinning, which makes two runs side by side ten times slower. A number in
     ``OMP_NUM_THREADS`` stands.
-
-    Args:
-        stage: What is trained.
-        config: Of the run.
     """
-    n_train, size = stage.data.n_train, config[stage.module.stage].batch_size
-    n_rows = min(n_train, size or n_train, config.data.chunk_size)
-    n_products = n_rows * max(parameter.numel() for parameter in stage.module.parameters())
+    n_products = stage.data.n_at_once * max(parameter.numel() for parameter in stage.module.parameters())
     alone = "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS
     with in_one_thread() if alone else nullcontext():
         yield
