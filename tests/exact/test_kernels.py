@@ -632,6 +632,11 @@ ENTRIES = {"rows.integrate_all", "lanes.integrate_all", "prepare.prepare", "bran
 ENTRIES |= {"kernel.sum_over_second"}
 
 
+def test_constants_have_the_names_of_their_places():
+    for names in (common.CONSTANTS, common.CONTROL):
+        assert [getattr(common, name.upper()) for name in names] == list(range(len(names)))
+
+
 COMPILED = [common, rows, lanes, prepare, branch_and_bound, likelihood_kernel]
 
 

@@ -11,6 +11,32 @@ F32: Final = np.float32
 BOND: Final = 1
 """Kind of field: bond dynamics; clause dynamics is 0."""
 
+ALPHA: Final = 0
+BETA: Final = 1
+GAMMA: Final = 2
+DELTA: Final = 3
+ZETA: Final = 4
+EPSILON: Final = 5
+KAPPA: Final = 6
+LONG_TERM_MAX: Final = 7
+UNIT_PULL: Final = 8
+SHORT_TERM_MIN: Final = 9
+SHORT_TERM_START: Final = 10
+PULL_SCALE: Final = 11
+CONSTANTS: Final = (
+    *("alpha", "beta", "gamma", "delta", "zeta", "epsilon", "kappa", "long_term_max", "unit_pull"),
+    *("short_term_min", "short_term_start", "pull_scale"),
+)
+"""What stands in a problem's row of constants, by the names of the fields' settings; 0 where a field has none."""
+
+CHANGE: Final = 0
+DT_MIN: Final = 1
+DT_MAX: Final = 2
+NOISE: Final = 3
+LAG: Final = 4
+CONTROL: Final = ("change", "dt_min", "dt_max", "noise", "lag")
+"""What stands in a problem's row of step control."""
+
 REFRESH: Final = 64
 """Local fields are summed from scratch each so many readings, which bounds their rounding error."""
 
@@ -37,8 +63,9 @@ def uniform(seed, counter):
 @njit(nogil=True, inline="always", fastmath=FAST_MATH)
 def clause_rates(c, dt):
     """What ``clause`` needs of the constants and the step: growth, keep, rise, fall, epsilon, top, cap."""
-    alpha, beta, gamma, delta, epsilon, one = c[0], c[1], c[2], c[3], c[4], F32(1)
-    return dt * beta, one - dt * beta * gamma, dt * alpha, -dt * alpha * delta, epsilon, one + epsilon, c[6] - one
+    alpha, beta, gamma, delta, epsilon, one = c[ALPHA], c[BETA], c[GAMMA], c[DELTA], c[EPSILON], F32(1)
+    cap = c[LONG_TERM_MAX] - one
+    return dt * beta, one - dt * beta * gamma, dt * alpha, -dt * alpha * delta, epsilon, one + epsilon, cap
 
 
 @njit(nogil=True, inline="always", fastmath=FAST_MATH)

@@ -69,7 +69,7 @@ def _run_rows(
     width, height, n_first, n_second = padded.sizes
     constants, control = _settings(field, integrator, *padded.scalars.T)
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
-    control[:, 0] *= np.sqrt(n / (width + height))
+    control[:, common.CHANGE] *= np.sqrt(n / (width + height))
     voltage = _pad(_array(start.voltage), n_first, width, width + height)
     kept: list[Array] = [_array(memory) for memory in start.kept]
     if kept:
@@ -235,20 +235,16 @@ def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
 def _settings(
     field: Field, integrator: Splitting, stability: Array, pull_scale: Array, degree: Array
 ) -> tuple[Array, Array]:
-    """Constants of the field and of the steps in the order in which the kernels read them, a row a problem."""
-    if isinstance(field, BondField):
-        values = [field.alpha, field.beta, field.gamma, field.kappa, field.delta, field.zeta]
-        values += [field.short_term_min, field.long_term_max, field.short_term_start, 1.0]
-    else:
-        values = [field.alpha, field.beta, field.gamma, field.delta, field.epsilon, field.zeta]
-        values += [field.long_term_max, field.unit_pull, 0.0, 1.0]
-    constants = np.tile(np.array(values, np.float32), (len(stability), 1))
-    constants[:, 9] = pull_scale
+    """Constants of the field and of the steps as the kernels read them, a row a problem."""
+    constants = np.zeros((len(stability), len(common.CONSTANTS)), np.float32)
+    for index, name in enumerate(common.CONSTANTS):
+        constants[:, index] = getattr(field, name, 0.0)
+    constants[:, common.PULL_SCALE] = pull_scale
     if isinstance(field, ClauseField):
-        constants[:, 6] = field.most_long_term(degree)
+        constants[:, common.LONG_TERM_MAX] = field.most_long_term(degree)
     limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
     control = np.tile(np.array(limits, np.float32), (len(stability), 1))
-    control[:, 0] *= stability
+    control[:, common.CHANGE] *= stability
     return constants, control
 
 

@@ -15,12 +15,29 @@ import numpy as np
 from numba import njit
 
 from memcomp_lightning.solvers.dmm.kernels.common import (
+    ALPHA,
+    BETA,
     BOND,
+    CHANGE,
+    DELTA,
+    DT_MAX,
+    DT_MIN,
+    EPSILON,
     F32,
     FAST_MATH,
+    GAMMA,
+    KAPPA,
+    LAG,
+    LONG_TERM_MAX,
     MAX_SWEEPS,
+    NOISE,
+    PULL_SCALE,
     REFRESH,
+    SHORT_TERM_MIN,
+    SHORT_TERM_START,
     TINY,
+    UNIT_PULL,
+    ZETA,
     clause,
     clause_rates,
     copy,
@@ -63,7 +80,8 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
     ``memory`` holds X and Y - 1 of each bond, ``rate`` the drive and the pull of each spin, ``(..., 2, lanes)``.
     """
     zero, one = F32(0), F32(1)
-    gamma, kappa, delta, zeta, low, cap = c[2], c[3], c[4], c[5], c[6], c[7] - one
+    gamma, kappa, delta, zeta = c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
+    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
     lift = gamma - one
     lanes = U64(dt.size)
     m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
@@ -95,7 +113,8 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
 def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
     """The same for clauses of three literals and more, padded with polarity 0; the last arrays are scratch."""
     zero, half, one = F32(0), F32(0.5), F32(1)
-    alpha, beta, gamma, delta, epsilon, cap = c[0], c[1], c[2], c[3], c[4], c[6] - one
+    alpha, beta, gamma, delta, epsilon = c[ALPHA], c[BETA], c[GAMMA], c[DELTA], c[EPSILON]
+    cap = c[LONG_TERM_MAX] - one
     variables, polarity, weight = longer
     lanes = U64(dt.size)
     m, v, r, f = memory.ravel(), voltage.ravel(), rate.ravel(), falsehood.ravel()
@@ -140,7 +159,7 @@ def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
 def clause_units(unit, long, voltage, rate, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
-    alpha, delta, cap, strength = c[0], c[3], c[6] - one, c[7]
+    alpha, delta, cap, strength = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
     for i in range(unit.size):
         u = unit[i]
         sign = half if u > 0 else (-half if u < 0 else F32(0))
@@ -155,8 +174,9 @@ def clause_units(unit, long, voltage, rate, c, dt):
 def bond_fields(field, short, long, voltage, rate, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
-    alpha, gamma, kappa, delta, zeta, low, cap = c[0], c[2], c[3], c[4], c[5], c[6], c[7] - one
-    pull_rate = F32(2) * c[1] / c[9]
+    alpha, gamma, kappa, delta, zeta = c[ALPHA], c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
+    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
+    pull_rate = F32(2) * c[BETA] / c[PULL_SCALE]
     for i in range(field.size):
         h = field[i]
         size = abs(h)
@@ -282,7 +302,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         stop: One number; anything but 0 ends the integration at the next step.
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
-        control: (change, dt_min, dt_max, noise, lag), a problem each.
+        control: Step control, named in ``common.CONTROL``, ``(n_problems, 5)``.
         start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed.
         steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
         best: Out, ``(n_problems, n_blocks, lanes, n)``.
@@ -336,7 +356,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
             and weight).
         digital: What ``flip`` needs.
         linear: ``(n,)``, of the energy.
-        c: Constants of the field, in the order of ``cpu._constants``.
+        c: Constants of the field, named in ``common.CONSTANTS``.
         control: (change, dt_min, dt_max, noise, lag), a problem each.
         start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
@@ -355,7 +375,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
     rate, push = np.zeros((n, 2, lanes), F32), np.empty(2 * lanes, F32)
     memory, longer_memory = np.empty((n_pairs, 2, lanes), F32), np.empty((n_longer, 2, lanes), F32)
-    unit_short = np.full((n, lanes), c[8], F32)
+    unit_short = np.full((n, lanes), c[SHORT_TERM_START], F32)
     falsehood = np.empty((longer_variables.shape[1], lanes), F32)
     # Arrays of their own: rows of one array could overlap for all that the compiler knows.
     smallest, next_smallest, at = np.empty(lanes, F32), np.empty(lanes, F32), np.empty(lanes, F32)
@@ -364,7 +384,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         for k in range(lanes):
             false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
             false_second = half - half * polarity[e, 1] * voltage[pairs[e, 1], k]
-            memory[e, 0, k] = c[8] if kind == BOND else c[4] + min(false_first, false_second)
+            memory[e, 0, k] = c[SHORT_TERM_START] if kind == BOND else c[EPSILON] + min(false_first, false_second)
             memory[e, 1, k] = long[e, k]
     for e in range(n_longer):
         for k in range(lanes):
@@ -373,7 +393,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                 sign = longer_polarity[e, j]
                 if sign != 0:
                     unsatisfied = min(unsatisfied, half - half * sign * voltage[longer_variables[e, j], k])
-            longer_memory[e, 0, k] = c[4] + unsatisfied
+            longer_memory[e, 0, k] = c[EPSILON] + unsatisfied
             longer_memory[e, 1, k] = longer_long[e, k]
     x, field, true = np.empty((lanes, n), F32), np.empty((lanes, n), F32), np.zeros((lanes, n_longer), np.int32)
     tried, tried_field, tried_true = np.empty(n, F32), np.empty(n, F32), np.empty(n_longer, np.int32)
@@ -438,7 +458,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                     n_running -= 1
         if step == n_steps or stop[0] != 0 or n_running == 0:
             break
-        lag = control[4] if step > 0 else F32(0)
+        lag = control[LAG] if step > 0 else F32(0)
         size[:] = 0
         for i in range(n):
             for k in range(lanes):
@@ -449,16 +469,16 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                 size[k] += rate[i, 0, k] * rate[i, 0, k]
         for k in range(lanes):
             # A step of size 0 leaves voltages and memories where they are.
-            change = control[0] / max(F32(math.sqrt(size[k] / F32(n))), TINY)
-            dt[k] = min(control[2], max(control[1], change)) if last[k] == n_steps else F32(0)
+            change = control[CHANGE] / max(F32(math.sqrt(size[k] / F32(n))), TINY)
+            dt[k] = min(control[DT_MAX], max(control[DT_MIN], change)) if last[k] == n_steps else F32(0)
             elapsed[k] += dt[k]
         for i in range(n):
             for k in range(lanes):
                 voltage[i, k] += dt[k] * rate[i, 0, k]
-        if control[3] > 0:
+        if control[NOISE] > 0:
             for i in range(n):
                 for k in range(lanes):
-                    voltage[i, k] += control[3] * math.sqrt(dt[k]) * uniform(seeds[k], counter + U64(i))
+                    voltage[i, k] += control[NOISE] * math.sqrt(dt[k]) * uniform(seeds[k], counter + U64(i))
             counter += U64(n)
         for i in range(n):
             for k in range(lanes):

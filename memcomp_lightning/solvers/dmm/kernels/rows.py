@@ -14,12 +14,29 @@ import numpy as np
 from numba import njit
 
 from memcomp_lightning.solvers.dmm.kernels.common import (
+    ALPHA,
+    BETA,
     BOND,
+    CHANGE,
+    DELTA,
+    DT_MAX,
+    DT_MIN,
+    EPSILON,
     F32,
     FAST_MATH,
+    GAMMA,
+    KAPPA,
+    LAG,
+    LONG_TERM_MAX,
     MAX_SWEEPS,
+    NOISE,
+    PULL_SCALE,
     REFRESH,
+    SHORT_TERM_MIN,
+    SHORT_TERM_START,
     TINY,
+    UNIT_PULL,
+    ZETA,
     clause,
     clause_rates,
     copy,
@@ -59,7 +76,7 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
 def clause_units(unit, long, voltage, drive, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
-    alpha, delta, cap, pull = c[0], c[3], c[6] - one, c[7]
+    alpha, delta, cap, pull = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
     for i in range(unit.size):
         u = unit[i]
         sign = half if u > 0 else (-half if u < 0 else F32(0))
@@ -76,7 +93,8 @@ def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt)
     ``long`` holds Y - 1.
     """
     zero, one = F32(0), F32(1)
-    gamma, kappa, delta, zeta, low, cap = c[2], c[3], c[4], c[5], c[6], c[7] - one
+    gamma, kappa, delta, zeta = c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
+    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
     growth, lift = dt * gamma - dt, dt * gamma * kappa
     # Where X <= 1 cannot lift Y from its lower bound, Y stays there and need not be read.
     frozen = delta <= zeta
@@ -119,8 +137,9 @@ def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt)
 def bond_fields(field, short, long, voltage, drive, pull, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
-    alpha, gamma, kappa, delta, zeta, low, cap = c[0], c[2], c[3], c[4], c[5], c[6], c[7] - one
-    pull_rate = F32(2) * c[1] / c[9]
+    alpha, gamma, kappa, delta, zeta = c[ALPHA], c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
+    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
+    pull_rate = F32(2) * c[BETA] / c[PULL_SCALE]
     for i in range(field.size):
         h = field[i]
         sign = one if h > zero else (-one if h < zero else zero)
@@ -241,7 +260,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         stop: One number; anything but 0 ends the integration at the next step.
         problem: (kind, sizes, side, constants, weight, unit, coupling, transposed, linear), the last six a problem
             each, matrices flat; sizes are n_first, n_second, and how many of both are no padding.
-        control: (change, dt_min, dt_max, noise, lag), a problem each.
+        control: Step control, named in ``common.CONTROL``, ``(n_problems, 5)``.
         start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``; without restarts, the
             memories begin at rest and are not returned.
         steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
@@ -287,8 +306,8 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
 
     Args:
         problem: (kind, sizes, side, weight or bond, unit or field, coupling, its transpose, linear).
-        c: Constants of the field, in the order of ``cpu._constants``.
-        control: (change, dt_min, dt_max, noise, lag).
+        c: Constants of the field, named in ``common.CONSTANTS``.
+        control: Named in ``common.CONTROL``.
         voltage: ``(n,)``; initial values in, final values out.
         long: Long-term memories less 1, in and out.
         unit_long: Those of the unit clauses or fields, ``(n,)``, in and out.
@@ -306,12 +325,12 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
     half, one = F32(0.5), F32(1)
     n = voltage.size
     drive, pull, before = np.zeros(n, F32), np.zeros(n, F32), np.zeros(n, F32)
-    unit_short = np.full(n, c[8], F32)
+    unit_short = np.full(n, c[SHORT_TERM_START], F32)
     if kind == BOND:
-        short = np.full(weight.size, c[8], F32)
+        short = np.full(weight.size, c[SHORT_TERM_START], F32)
     else:
         short = np.empty(weight.size, F32)
-        start_short(n_first, rows, weight, side, short, voltage, c[4])
+        start_short(n_first, rows, weight, side, short, voltage, c[EPSILON])
     x, field = np.empty(n, F32), np.empty(n, F32)
     tried, tried_field, found = np.empty(n, F32), np.empty(n, F32), np.empty(n + 1, np.uint64)
     for i in range(n):
@@ -359,18 +378,18 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
             clause_units(unit, unit_long, voltage, drive, c, dt)
         if step == n_steps or stop[0] != 0 or (reads and step >= min_steps + stall * found_at):
             break
-        lag = control[4] if step > 0 else F32(0)
+        lag = control[LAG] if step > 0 else F32(0)
         size = F32(0)
         for i in range(n):
             rate = drive[i]
             drive[i] += lag * (before[i] - rate)
             before[i] = rate
             size += drive[i] * drive[i]
-        dt = min(control[2], max(control[1], control[0] / max(F32(math.sqrt(size / F32(n))), TINY)))
+        dt = min(control[DT_MAX], max(control[DT_MIN], control[CHANGE] / max(F32(math.sqrt(size / F32(n))), TINY)))
         for i in range(n):
             voltage[i] += dt * drive[i]
-        if control[3] > 0:
-            width = control[3] * F32(math.sqrt(dt))
+        if control[NOISE] > 0:
+            width = control[NOISE] * F32(math.sqrt(dt))
             for i in range(columns):
                 voltage[i] += width * uniform(seed, counter + i)
             for i in range(rows):
