@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from hydra.plugins.completion_plugin import CompletionPlugin
 
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.runs.paths import is_path
 
 SHOWING = ("help", "hydra_help", "cfg", "info", "shell_completion")
 """Flags that show something and run nothing; the settings are checked all the same."""
@@ -39,7 +40,6 @@ REFUSED = {
 BY_ENTRY = ("version",)
 """Flags that are answered before Hydra is imported."""
 
-_PATH_NAMES = re.compile(r"(.*\.)?(\w+_)?(problem|weights|path|file|filename|dir|dirpath|folder|root)")
 _NEVER_SWEPT = ("hydra.run.dir", "hydra.sweep.dir", "resume")
 _SEARCH_PATH = "hydra.searchpath"
 # Code points, as many of these signs look like others: dashes and the minus sign; quotation marks.
@@ -123,11 +123,6 @@ def read(arguments: Sequence[str]) -> CommandLine:
         overrides = [_readable(override, multirun=multirun) for override in overrides]
     folder = None if given.config_dir is None else Path(expanded("--config-dir", given.config_dir)).absolute()
     return CommandLine(tuple(overrides), multirun, tuple(shows), folder, given.package)
-
-
-def is_path(name: str) -> bool:
-    """Whether a setting holds a path: a problem, weights, a folder."""
-    return _PATH_NAMES.fullmatch(name.lstrip("+")) is not None
 
 
 def unquoted(text: str) -> str:

@@ -21,11 +21,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.arguments import CommandLine, is_path, parse
+from memcomp_lightning.cli.arguments import CommandLine, parse
 from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, explain, unknown_setting
 from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.runs.paths import is_path
 
 CONFIG_MODULE = "memcomp_lightning.conf"
 

@@ -16,6 +16,7 @@ import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import write_text
+from memcomp_lightning.runs.paths import is_path
 
 
 @dataclass(frozen=True)
@@ -125,16 +126,16 @@ class RunFolder:
         for name in sorted(there.keys() | now.keys()):
             if name.startswith(_FREE_TO_CHANGE) or there.get(name) == now.get(name):
                 continue
-            if not self._same_path(there.get(name), now.get(name)):
+            if not self._same_path(name, there.get(name), now.get(name)):
                 raise UserError(
                     f"run folder {self.path} was made with {name}={there.get(name)}, not {now.get(name)}: choose "
                     "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
                 )
 
-    def _same_path(self, there: Any, now: Any) -> bool:
+    def _same_path(self, name: str, there: Any, now: Any) -> bool:
         """Whether a path of then, meant from where it was typed, is one of now."""
-        both = isinstance(there, str) and isinstance(now, str)
-        return both and self.typed_in / there == Path.cwd() / now
+        paths = is_path(name) and isinstance(there, str) and isinstance(now, str)
+        return paths and self.typed_in / there == Path.cwd() / now
 
     def _read(self, name: str) -> dict[str, Any] | None:
         try:

@@ -10,12 +10,10 @@ from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
 from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint
@@ -65,7 +63,7 @@ def run(
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
             if stage is plan.pretraining:
-                _between(plan, seed)
+                plan.change_between_stages(seed)
             continue
         with threads_for(stage):
             trainer = _fit(stage, make_trainer(stage), folder)
@@ -75,7 +73,7 @@ def run(
             save_weights(stage.module.network, folder.weights(name))
             folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
-            _between(plan, seed)
+            plan.change_between_stages(seed)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
     if choice is not None:
         result["choice"] = choice
@@ -93,12 +91,6 @@ def run(
         _log_final(loggers, settings, result)
         folder.finish(result)
     return result
-
-
-def _between(plan: Plan, seed: int) -> None:
-    """What is done to the pretrained network before it is fine-tuned, the same when a run is resumed."""
-    if plan.between is not None and isinstance(plan.network, DBN):
-        plan.between(plan.network, generator=rng.stream(seed, "between stages"))
 
 
 def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:

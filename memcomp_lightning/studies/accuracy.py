@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from memcomp_lightning import rng
 from memcomp_lightning.errors import require_count
-from memcomp_lightning.models import DBN, stacked
+from memcomp_lightning.models import stacked
 from memcomp_lightning.modules import Classifier, EnergyPretraining
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.studies.records import Record
@@ -217,7 +216,7 @@ def _record(
 
 def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
     """Train the DBN of a plan, and change it as the control says."""
-    network = plan.network.to(device)
+    plan.network.to(device)
     if plan.pretraining is not None:
         stage = plan.pretraining
         module, batches = stage.module, stage.data.train_batches(0, 1).to(device)
@@ -234,8 +233,7 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
         )
         for _ in passes:
             pass
-    if plan.between is not None and isinstance(network, DBN):
-        plan.between(network, generator=rng.stream(seed, "between stages"))
+    plan.change_between_stages(seed)
     return plan
 
 

@@ -7,8 +7,9 @@ from typing import Any
 import lightning.pytorch as pl
 from torch import nn
 
+from memcomp_lightning import rng
 from memcomp_lightning.data import ImageDataModule
-from memcomp_lightning.models import Randomiser
+from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import StageModule
 from memcomp_lightning.training import PretrainingStage
 
@@ -45,6 +46,11 @@ class Plan:
     finetuning: Stage | None
     between: Randomiser | None = None
     stage_for: Callable[[Any], PretrainingStage] | None = None
+
+    def change_between_stages(self, seed: int) -> None:
+        """Do to the pretrained network what is done before it is fine-tuned; the same each time."""
+        if self.between is not None and isinstance(self.network, DBN):
+            self.between(self.network, generator=rng.stream(seed, "between stages"))
 
     @property
     def stages(self) -> list[Stage]:

@@ -357,7 +357,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         digital: What ``flip`` needs.
         linear: ``(n,)``, of the energy.
         c: Constants of the field, named in ``common.CONSTANTS``.
-        control: (change, dt_min, dt_max, noise, lag), a problem each.
+        control: Step control, named in ``common.CONTROL``.
         start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
         steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
