@@ -1,6 +1,8 @@
 """A word about the first use of compiled kernels, which takes a while."""
 
 import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -27,6 +29,22 @@ def announce_compilation() -> None:
             pass
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def told(tell: Callable[[str], object]) -> Iterator[None]:
+    """Hand what is logged here to a function, whatever is set up for logs otherwise."""
+    handler, before = logging.Handler(), (log.level, log.propagate)
+    handler.emit = lambda record: tell(record.getMessage())  # type: ignore[assignment, method-assign]
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before[0])
+        log.propagate = before[1]
 
 
 @cache

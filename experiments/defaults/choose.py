@@ -6,12 +6,11 @@ python experiments/defaults/choose.py         # about half an hour on one core
 import statistics
 
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
+from hydra import compose
 
-from memcomp_lightning.cli.hydra_versions import INITIALIZE
-from memcomp_lightning.cli.overrides import CONFIG_MODULE
-from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
+from memcomp_lightning.configuration.choice import trial_of
+from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.studies import SideBySide
 
 SPLITS = (100, 101, 102)
 """Seeds of runs and of splits into training and test images, others than those of the table that is reported."""
@@ -48,10 +47,9 @@ def accuracies(overrides: list[str]) -> list[list[float]]:
     rows = []
     for seed in SPLITS:
         held_out = [f"data.source.split_seed={seed}", "data.validation_fraction=0.2"]
-        config = OmegaConf.to_container(compose("config", [*overrides, *held_out]), resolve=False)
-        member = Member("choose", config, config["pretrain"]["iterations"], seed, None, choosing=False)
-        (record,) = run_unit(Unit((member,), PASSES, 0), lambda what, n_updates: None)
-        rows.append([of_pass[0] for of_pass in record.scores["validation_accuracy"]])
+        trial = trial_of(compose("config", [*overrides, *held_out]), "choose", seed=seed)
+        (record,) = SideBySide((trial,), PASSES, 0).run(lambda what, n_updates: None)
+        rows.append([of_pass[0] for of_pass in record.measures["validation_accuracy"]])
     return rows
 
 
@@ -62,7 +60,7 @@ def main() -> None:
     tried += [(name, "rate .2, momentum .9") for name in FURTHER_RUNS]
     print(f"| run | fine-tuning | {' | '.join(f'{n} passes' for n in PASSES)} |")
     print("| --- | --- |" + " --- |" * len(PASSES))
-    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+    with composing():
         for name, rate in tried:
             overrides = (RUNS | FURTHER_RUNS)[name] + RATES[rate]
             of_passes = zip(*accuracies(overrides), strict=True)

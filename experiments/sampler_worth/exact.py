@@ -12,7 +12,8 @@ import torch
 from memcomp_lightning.data import ImageData, ReducedMnist
 from memcomp_lightning.likelihood import log_likelihood, log_partition_function
 from memcomp_lightning.models import RBM
-from memcomp_lightning.studies.worth import read_worth, weights_path
+from memcomp_lightning.studies.likelihood import weights_path
+from memcomp_lightning.studies.worth import read_worth
 
 IMAGES = {"reduced_mnist": lambda: ReducedMnist(pixels="threshold").load()}
 
@@ -37,11 +38,11 @@ def main() -> None:
     print("| method | exact: median, worst | AIS: median, worst | largest difference | seconds |")
     print("| --- | --- | --- | --- | --- |")
     for method in worth.methods(given.data_set):
-        course = worth.best(given.data_set, method)
-        rbm, begin = model_of(weights_path(given.run, course), given.replicas), time.perf_counter()
+        record = worth.best(given.data_set, method)
+        rbm, begin = model_of(weights_path(given.run, record), given.replicas), time.perf_counter()
         log_z = log_partition_function(rbm, max_units=32)
         exact = -log_likelihood(rbm, images.test_v, log_z).mean(-1)
-        by_ais = torch.tensor(course.scores[-1][: given.replicas], dtype=torch.float64)
+        by_ais = torch.tensor(record.measures["score"][-1][: given.replicas], dtype=torch.float64)
         cells = [
             *(f"{float(x.median()):.3f}, {float(x.max()):.3f}" for x in (exact, by_ais)),
             f"{float((exact - by_ais).abs().max()):.3f}",

@@ -15,7 +15,8 @@ from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.problems import from_model
 from memcomp_lightning.solvers import GibbsAnnealing
 from memcomp_lightning.solvers.dmm import DmmSolver
-from memcomp_lightning.studies.worth import read_worth, weights_path
+from memcomp_lightning.studies.likelihood import weights_path
+from memcomp_lightning.studies.worth import read_worth
 
 
 def lowest_energy(rbm: RBM) -> torch.Tensor:

@@ -33,13 +33,14 @@ def _run(command: str, arguments: tuple[object, ...], on_interrupt: object) -> N
     from importlib import import_module
 
     from memcomp_lightning import __version__
-    from memcomp_lightning.cli.output import compilation_told, say, tolerant_streams
+    from memcomp_lightning.cli.output import say, tolerant_streams
+    from memcomp_lightning.compiling import told
 
     if {"--version", "-V"} & set(sys.argv[1:]):
         with tolerant_streams() as failures:
             say(f"{command} {__version__}")
         sys.exit(LOST_OUTPUT if failures else 0)
-    with tolerant_streams() as failures, compilation_told(command):
+    with tolerant_streams() as failures, told(lambda text: say(f"{command}: {text}", error=True)):
         try:
             main = import_module(f"memcomp_lightning.cli.commands.{command.removeprefix('memcomp-')}").main
             _answer_interrupts(on_interrupt)

@@ -8,12 +8,20 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
-
-from memcomp_lightning import compiling
+from typing import Any, NoReturn
 
 _PLAIN = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{PLUS-MINUS SIGN}": "+-", "\N{MIDDLE DOT}": "*"}
 """Signs of our tables in an encoding that has none of them."""
+
+
+USAGE_ERROR = 2
+"""Exit status when a setting is refused."""
+
+
+def refuse(command: str, error: Exception) -> NoReturn:
+    """End with the message alone."""
+    say(f"{command}: {error}", error=True)
+    sys.exit(USAGE_ERROR)
 
 
 def say(text: str = "", *, error: bool = False) -> None:
@@ -127,20 +135,3 @@ def _spelt_out(error: UnicodeError) -> tuple[str, int]:
     assert isinstance(error, UnicodeEncodeError)
     signs = error.object[error.start : error.end]
     return "".join(_PLAIN.get(s, s.encode("ascii", "backslashreplace").decode()) for s in signs), error.end
-
-
-@contextmanager
-def compilation_told(command: str) -> Iterator[None]:
-    """Print what ``compiling`` logs, before Hydra has set up logging as well as after it, as one plain line."""
-    log, handler = logging.getLogger(compiling.__name__), logging.Handler()
-    handler.emit = lambda record: say(f"{command}: {record.getMessage()}", error=True)  # type: ignore[method-assign]
-    before = log.level, log.propagate
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    log.propagate = False
-    try:
-        yield
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(before[0])
-        log.propagate = before[1]

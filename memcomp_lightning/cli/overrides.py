@@ -2,19 +2,17 @@
 
 import hashlib
 import itertools
-import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from types import NoneType
-from typing import Any
 
-from hydra import compose, initialize_config_module
+from hydra import compose
 from hydra.conf import HydraConf
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
@@ -22,15 +20,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.cli.arguments import CommandLine, parse
-from memcomp_lightning.cli.errors import CONFIGURATION_ERRORS, explain, unknown_setting
-from memcomp_lightning.cli.hydra_versions import INITIALIZE, register_resolver
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
-from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.configuration.composing import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
+from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, explain, unknown_setting
+from memcomp_lightning.configuration.hydra_versions import register_resolver
+from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.paths import is_path
 
-CONFIG_MODULE = "memcomp_lightning.conf"
-
-_SEARCH_PATH = "hydra.searchpath="
 _SEARCHES = ("hparams=", "hydra/sweeper=")
 
 LONGEST_NAME = 150
@@ -89,7 +85,7 @@ def check_command_line(
     if not line.shows:
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
     folder: str | None = None
-    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+    with composing():
         paths = search_paths(overrides)
         try:
             _check_options(overrides, config_name, paths)
@@ -280,13 +276,8 @@ def search_path(settings: HydraConf) -> list[str]:
     return [_searching(*(f"{source.schema}://{source.path}" for source in sources))] if sources else []
 
 
-def search_paths(overrides: Iterable[str]) -> list[str]:
-    """The overrides that say where to look for groups."""
-    return [override for override in overrides if override.startswith(_SEARCH_PATH)]
-
-
 def _searching(*places: str) -> str:
-    return f"{_SEARCH_PATH}{list(places)}"
+    return f"{SEARCH_PATH}{list(places)}"
 
 
 def _with_search_path(overrides: Sequence[str], folder: Path) -> list[str]:
@@ -321,41 +312,3 @@ def _raise_first(messages: Iterable[str | None]) -> None:
     for message in messages:
         if message is not None:
             raise UserError(message)
-
-
-def check_not_given(overrides: Iterable[str], instead: Mapping[str, str], of: str) -> None:
-    """Refuse overrides of what runs of many networks set themselves.
-
-    Args:
-        overrides: As typed.
-        instead: What to do in their place, by setting; OVERRIDE in it stands for what was typed.
-        of: The kind of run.
-    """
-    for override in overrides:
-        typed = override.lstrip("+")
-        name, _, value = typed.partition("=")
-        remedy = instead.get(name, "").replace("OVERRIDE", typed)
-        require(name not in instead, name, value, f"nothing in {of}", remedy)
-
-
-def check_entry(name: str, settings: DictConfig, known: Collection[str]) -> None:
-    """Refuse unknown settings of a curve, a data set or a method, and one without its label or overrides."""
-    for key in settings:
-        require_choice(f"setting of {name}", str(key), known)
-    for key in ("label", "overrides"):
-        require(key in settings, f"{name}.{key}", None, "a setting of each")
-
-
-def check_finite(node: Any, name: str = "") -> None:
-    """Refuse NaN and infinity anywhere: optimisers, samplers and solvers would take some of them."""
-    if isinstance(node, DictConfig):
-        for key in node:
-            if not OmegaConf.is_interpolation(node, str(key)):
-                check_finite(node[key], f"{name}.{key!s}".lstrip("."))
-    elif isinstance(node, float):
-        require(math.isfinite(node), name, node, "a finite number")
-
-
-def check_seed(seed: object) -> None:
-    """Refuse a seed that is no integer."""
-    require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")

@@ -7,6 +7,7 @@ from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
 from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier, mean_log_odds, start_at_means
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
+from memcomp_lightning.models.parts import energy_models, joint_model
 from memcomp_lightning.models.randomise import GaussianMoments, Randomiser, Shuffled
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.stack import stacked
@@ -33,7 +34,9 @@ __all__ = [
     "Uniform",
     "Xavier",
     "as_two_layers",
+    "energy_models",
     "hidden_blocks",
+    "joint_model",
     "mean_field",
     "mean_log_odds",
     "stacked",

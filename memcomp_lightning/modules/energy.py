@@ -97,6 +97,16 @@ class EnergyPretraining(StageModule):
         return self.pretraining.phases
 
     @property
+    def n_models(self) -> int:
+        """One a phase."""
+        return len(self.phases)
+
+    def record(self) -> dict[str, Any]:
+        """The same with the energy gaps and the names of the models."""
+        gaps = [gap.reshape(-1).tolist() for gap in self.energy_gaps]
+        return {**super().record(), "energy_gap": gaps, "trained": [phase.name for phase in self.phases]}
+
+    @property
     def models(self) -> list[Any]:
         """All energy models that are trained, in order."""
         return [phase.model for phase in self.phases]

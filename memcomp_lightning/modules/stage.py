@@ -92,6 +92,15 @@ class StageModule(pl.LightningModule):
         return self._seconds_before + running
 
     @property
+    def n_models(self) -> int:
+        """Models that the stage trains one after the other."""
+        return 1
+
+    def record(self) -> dict[str, Any]:
+        """What the stage did, as plain values for the record of its run."""
+        return {"iterations": self.iterations, "passes": self.passes, "wall_time_s": self.wall_time_s}
+
+    @property
     def active_optimizer(self) -> Optimizer:
         """The optimiser that steps now."""
         return self.trainer.optimizers[0]

@@ -14,7 +14,7 @@ from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
+from memcomp_lightning.modules import Classifier, NotTrainedError, load_weights, save_weights
 from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint
 from memcomp_lightning.runs.folder import RunFolder
@@ -118,24 +118,16 @@ def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:
 def _check_trained(stage: Stage) -> None:
     """Whatever stopped the stage, each of its models has been trained."""
     passes, module = stage.module.passes, stage.module
-    n_models = len(module.phases) if isinstance(module, EnergyPretraining) else 1
-    if len(passes) < n_models or min(passes) == 0:
+    if len(passes) < module.n_models or min(passes) == 0:
         raise UserError(
             f"{module.stage} ended after {' and '.join(map(str, passes))} passes, before all of its "
-            f"{n_models} models were trained: its weights are not recorded. Leave out the callback that ended it."
+            f"{module.n_models} models were trained: its weights are not recorded. "
+            "Leave out the callback that ended it."
         )
 
 
 def _record(stage: Stage) -> dict[str, Any]:
-    module = stage.module
-    record: dict[str, Any] = {
-        "iterations": module.iterations,
-        "passes": module.passes,
-        "wall_time_s": module.wall_time_s,
-    }
-    if isinstance(module, EnergyPretraining):
-        record["energy_gap"] = [_numbers(gap) for gap in module.energy_gaps]
-        record["trained"] = [phase.name for phase in module.phases]
+    record = stage.module.record()
     for callback in stage.callbacks:
         if isinstance(callback, LogLikelihood) and callback.history:
             record["log_likelihood"] = callback.history

@@ -1,30 +1,32 @@
 """What trains many networks and compares them: trials, records, choices, results, verdicts, reports."""
 
-from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
-from memcomp_lightning.studies.likelihood import Job, run_job
+from memcomp_lightning.studies.accuracy import AccuracyTrial, SideBySide, grouped
+from memcomp_lightning.studies.likelihood import LikelihoodTrial
 from memcomp_lightning.studies.page import Section, markdown, page
 from memcomp_lightning.studies.plan import Plan, Stage
-from memcomp_lightning.studies.records import Record, Records
+from memcomp_lightning.studies.records import Record, Records, best
 from memcomp_lightning.studies.results import Claim, FigurePlan, Results, read_results
+from memcomp_lightning.studies.runner import runner
 from memcomp_lightning.studies.verdicts import Verdict, verdicts
 
 __all__ = [
+    "AccuracyTrial",
     "Claim",
     "FigurePlan",
-    "Job",
-    "Member",
+    "LikelihoodTrial",
     "Plan",
     "Record",
     "Records",
     "Results",
     "Section",
+    "SideBySide",
     "Stage",
-    "Unit",
     "Verdict",
+    "best",
+    "grouped",
     "markdown",
     "page",
     "read_results",
-    "run_job",
-    "run_unit",
+    "runner",
     "verdicts",
 ]

@@ -4,10 +4,11 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,25 +16,25 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.models import DBM, DBN, stacked
+from memcomp_lightning.models import joint_model, stacked
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
 from memcomp_lightning.studies.plan import Plan, Stage
-from memcomp_lightning.studies.worth import Course, weights_path
+from memcomp_lightning.studies.records import Key, Record
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass, pretrain
 
 
 @dataclass(frozen=True)
-class Job:
+class LikelihoodTrial:
     """All replicas of one method at one learning rate on one data set.
 
     Attributes:
         data_set: Name of the data set.
         method: Name of the method.
-        rate: Learning rate of the first update.
+        value: Learning rate of the first update; held-out data choose one.
         folder: Of the run: final weights go there.
         settings: Of a single run, as plain values.
         build: Makes the objects of a run from its settings; a function of a module, which processes can import.
@@ -47,7 +48,7 @@ class Job:
 
     data_set: str
     method: str
-    rate: float
+    value: float
     folder: str
     settings: dict[str, Any]
     build: Callable[[dict[str, Any]], Plan]
@@ -71,7 +72,64 @@ class Job:
     @property
     def title(self) -> str:
         """For people."""
-        return f"{self.data_set}, {self.method}, lr = {self.rate:g}"
+        return f"{self.data_set}, {self.method}, lr = {self.value:g}"
+
+    @property
+    def key(self) -> Key:
+        """Of the record that it leaves."""
+        return self.data_set, self.method, self.value, None, None, False
+
+    def run(self, progress: Progress) -> list[Record]:
+        """Train the replicas side by side and measure them; measurements do not count as time.
+
+        On one thread, and seconds are those of the processor: methods are compared by them while others run
+        beside.
+        """
+        with in_one_thread():
+            return self._run(progress)
+
+    def _run(self, progress: Progress) -> list[Record]:
+        plans = [self.build({**self.settings, "seed": seed}) for seed in range(self.n_replicas)]
+        stage, module = pretraining_of(plans[0])
+        network = stacked([plan.network for plan in plans], ())
+        batches = stage.data.train_batches(0, 1).repeated(range(self.n_replicas))
+        _warm_up(joint_model(network), module, next(iter(batches)).v)
+        measure, seconds = MEASURES[self.measure], 0.0
+        score = measure.make(stage.data, self.n_reported)
+        begin, reported = time.process_time(), 0
+        training = _training(self, plans[0], network, batches)
+        names = ["score", "reverse"][: 1 + measure.both_ways]
+        record = Record(
+            data_set=self.data_set,
+            method=self.method,
+            value=self.value,
+            at=[],
+            seconds=[],
+            measures={name: [] for name in (*names, "cosine", "relative_error")},
+        )
+        updates_a_pass = sum(batch.closes_step for batch in batches)
+        try:
+            for done in training.passes:
+                if done.number not in self.points:
+                    continue
+                seconds += time.process_time() - begin
+                progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
+                reported = done.number
+                model, diverged = without_diverged(training.model())
+                scores = [x.double().masked_fill(diverged, math.inf) for x in score(model) if x is not None]
+                bias = gradient_bias(model, module.sampler, done, self.gradient_draws)
+                _add(record, done.number * updates_a_pass, seconds, [x.tolist() for x in (*scores, *bias)])
+                begin = time.process_time()
+        except (DivergedError, SettingError):  # the second is a solver's that is given NaN
+            worst, nothing = [math.inf] * self.n_replicas, [math.nan] * self.n_replicas
+            measured = record.at[-1] if record.at else 0
+            for updates in (point * updates_a_pass for point in self.points):
+                if updates > measured:
+                    _add(record, updates, seconds, [*(worst for _ in names), nothing, nothing])
+        record = replace(record, held_out=-float(np.median(record.measured("score")[-1, self.n_reported :])))
+        with written_whole(weights_path(Path(self.folder), record)) as path:
+            torch.save(training.model().state_dict(), path)
+        return [record]
 
 
 class Training(NamedTuple):
@@ -86,7 +144,7 @@ class Training(NamedTuple):
     model: Callable[[], Any]
 
 
-def module_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
+def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
     """The pretraining of a plan."""
     stage = plan.pretraining
     assert stage is not None
@@ -94,87 +152,39 @@ def module_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
     return stage, stage.module
 
 
-def side_by_side(plans: Sequence[Plan]) -> Any:
-    """The networks of plans as one with a replica axis: a DBN, or a Boltzmann machine."""
-    return stacked([plan.network for plan in plans], ())
+def weights_path(folder: Path, record: Record) -> Path:
+    """Final weights of a trial: a state dict of the model with its replicas, the reported ones first."""
+    return folder / "weights" / f"{record.data_set}-{record.method}-{record.value:g}.pt"
 
 
-def model_of(network: Any) -> Any:
-    """The energy model that a network is: itself, its only RBM, or the DBM of its layers."""
-    if not isinstance(network, DBN):
-        return network
-    return network[0] if len(network) == 1 else DBM.from_dbn(network)
+def _add(record: Record, updates: int, seconds: float, values: Sequence[list[float]]) -> None:
+    """Append a measurement: a list over replicas for each measure."""
+    record.at.append(updates)
+    record.seconds.append(seconds)
+    for kept, new in zip(record.measures.values(), values, strict=True):
+        kept.append(new)
 
 
-def run_job(job: Job, progress: Progress) -> list[Course]:
-    """Train the replicas of a job side by side and measure them; measurements do not count as time.
-
-    On one thread, and seconds are those of the processor: methods are compared by them while others run beside.
-    """
-    with in_one_thread():
-        return _run_job(job, progress)
-
-
-def _run_job(job: Job, progress: Progress) -> list[Course]:
-    plans = [job.build({**job.settings, "seed": seed}) for seed in range(job.n_replicas)]
-    stage, module = module_of(plans[0])
-    network = side_by_side(plans)
-    batches = stage.data.train_batches(0, 1).repeated(range(job.n_replicas))
-    _warm_up(model_of(network), module, next(iter(batches)).v)
-    measure, seconds = MEASURES[job.measure](stage.data, job.n_reported), 0.0
-    begin, reported = time.process_time(), 0
-    training = _training(job, plans[0], network, batches)
-    course = Course(job.data_set, job.method, job.rate)
-    updates_a_pass = sum(batch.closes_step for batch in batches)
-    try:
-        for done in training.passes:
-            if done.number not in job.points:
-                continue
-            seconds += time.process_time() - begin
-            progress(f"{job.title}, pass {done.number} of {job.points[-1]}", done.number - reported)
-            reported = done.number
-            model, diverged = without_diverged(training.model())
-            bias = gradient_bias(model, module.sampler, done, job.gradient_draws)
-            course.add(
-                done.number * updates_a_pass,
-                seconds,
-                [
-                    None if values is None else values.double().masked_fill(diverged, math.inf).tolist()
-                    for values in measure(model)
-                ],
-                [values.tolist() for values in bias],
-            )
-            begin = time.process_time()
-    except (DivergedError, SettingError):  # the second is a solver's that is given NaN
-        worst, nothing = [math.inf] * job.n_replicas, [math.nan] * job.n_replicas
-        scores = [worst, worst if job.measure == "ais" else None]
-        measured = course.updates[-1] if course.updates else 0
-        for updates in (point * updates_a_pass for point in job.points):
-            if updates > measured:
-                course.add(updates, seconds, scores, [nothing, nothing])
-    with written_whole(weights_path(Path(job.folder), course)) as path:
-        torch.save(training.model().state_dict(), path)
-    return [course]
-
-
-def _training(job: Job, plan: Plan, network: Any, batches: Batches) -> Training:
+def _training(trial: LikelihoodTrial, plan: Plan, network: Any, batches: Batches) -> Training:
     """Layer by layer, or all units at once."""
-    module = module_of(plan)[1]
+    module = pretraining_of(plan)[1]
     settings: dict[str, Any] = {
         "optimizer": module.make_optimizer,
         "schedules": module.schedules,
         "centring": module.centring,
     }
     done = 0
-    if job.greedy_passes:
-        for before in pretrain(Greedy(network), batches, module.sampler, iterations=job.greedy_passes, **settings):
+    if trial.greedy_passes:
+        for before in pretrain(
+            Greedy(network), batches, module.sampler, iterations=trial.greedy_passes, **settings
+        ):
             done = before.number
     assert plan.stage_for is not None
     stage = plan.stage_for(network)
     passes = pretrain(stage, batches, module.sampler, iterations=module.iterations, **settings)
     return Training(
         (after._replace(number=done + after.number) for after in passes),
-        lambda: stage.phases[0].model if len(stage.phases) == 1 else model_of(network),
+        lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network),
     )
 
 

@@ -56,10 +56,10 @@ def _report_worth(folder: Path) -> Section:
     """The same of a comparison of samplers."""
     worth = read_worth(folder)
     if not worth.data_sets:
-        raise NothingMeasuredError(f"{folder} has no courses yet")
+        raise NothingMeasuredError(f"{folder} has no records yet")
     figures, judged, notes = write_worth(worth, folder)
     pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
-    return Section(worth.plan["title"], pictures, judged, [*_origin(folder), *notes], WORTH_RULE)
+    return Section(worth.plan.title, pictures, judged, [*_origin(folder), *notes], WORTH_RULE)
 
 
 def save(folder: Path, name: str, figure: Figure) -> bytes:

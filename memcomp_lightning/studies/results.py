@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require_choice
-from memcomp_lightning.studies.records import Records
+from memcomp_lightning.studies.records import Record, Records
 
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """The paper says that one curve is better than another.
+    """One curve is said to be better than another.
 
     Attributes:
         better: Name of a curve.
@@ -29,7 +29,7 @@ class Claim:
 
     better: str
     than: str
-    controls: Sequence[str] | None = None
+    controls: list[str] | None = None
 
     @property
     def curves(self) -> tuple[str, str]:
@@ -108,16 +108,16 @@ class Results:
 
     def __init__(self, plan: FigurePlan, records: Records) -> None:
         self.plan = plan
-        self.chosen: dict[str, float | None] = {curve: records.best_choice(curve) for curve in plan.labels}
+        self.chosen: dict[str, float | None] = {curve: records.best_value(curve) for curve in plan.labels}
         self._values: dict[str, dict[int, dict[int, NDArray[np.float64]]]] = {}
-        self.seconds = sum(record.pretrain_s + record.finetune_s for record in records.all)
+        self.seconds = sum(record.seconds[-1] for record in records.all)
         for curve in plan.labels:
             by_length: dict[int, list[NDArray[np.float64]]] = {}
             seeds = {record.seed for record in records.all if not record.choosing}
             for record in records.of(curve):
                 early = curve in plan.stop_early
-                accuracy = record.at_best_validation() if early else record.score("test_accuracy")
-                by_length.setdefault(record.iterations, []).append(accuracy)
+                accuracy = at_best_validation(record) if early else record.measured("test_accuracy")
+                by_length.setdefault(record.iterations or 0, []).append(accuracy)
             # A point counts once all seeds have trained: differences are between pairs.
             whole = {n: parts for n, parts in by_length.items() if len(parts) == len(seeds)}
             if whole:
@@ -163,6 +163,13 @@ class Results:
         buffer = io.StringIO()
         csv.writer(buffer, lineterminator="\n").writerows(rows)
         return buffer.getvalue()
+
+
+def at_best_validation(record: Record) -> NDArray[np.float64]:
+    """Test accuracy at the tested pass of highest validation accuracy so far, ``(n_passes, n_replicas)``."""
+    validation, test = record.measured("validation_accuracy"), record.measured("test_accuracy")
+    best = np.array([validation[: k + 1].argmax(0) for k in range(len(validation))])
+    return np.take_along_axis(test, best, axis=0)
 
 
 def read_results(folder: Path) -> Results:

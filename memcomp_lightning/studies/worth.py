@@ -1,8 +1,8 @@
-"""Courses of training by many samplers: the best learning rate of each, and what mode assistance brings."""
+"""Comparisons of samplers by likelihood: each at its best learning rate, and what mode assistance brings."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,67 +10,124 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from memcomp_lightning.studies.records import JsonLines
+from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.studies.measures import MEASURES
+from memcomp_lightning.studies.records import Record, Records, best
 from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
 
 
-@dataclass(frozen=True)
-class Course:
-    """One method at one learning rate on one data set, all its replicas.
+@dataclass(frozen=True, kw_only=True)
+class DataSet:
+    """What methods are compared on; what it leaves open the comparison says.
 
     Attributes:
-        data_set: Name.
-        method: Name.
-        rate: Learning rate.
-        updates: Updates done at each measurement.
-        seconds: Seconds of training until then, of all replicas side by side.
-        scores: Divergence or negative log-likelihood in nats, by measurement and replica: less is better.
-        cosines: Cosine of the mean gradient with the exact one, likewise.
-        reverse: Scores by the partition function of reverse AIS, likewise; empty where it is not estimated.
-        cosines: Cosine of the mean gradient with the exact one, likewise.
-        errors: Relative error of the mean gradient, likewise.
+        label: For people.
+        overrides: Of its runs, as on the command line.
+        passes: Of training, for a method of usual length.
+        measure: A name in :data:`MEASURES`.
+        methods: Names of those that are trained; None for all.
+        rates: Learning rates that are tried.
+        replicas: Seeds that are reported.
+        choosing: Further seeds that choose the learning rate.
+        points: Measurements along a training.
     """
 
-    data_set: str
-    method: str
-    rate: float
-    updates: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    scores: list[list[float]] = field(default_factory=list)
-    reverse: list[list[float]] = field(default_factory=list)
-    cosines: list[list[float]] = field(default_factory=list)
-    errors: list[list[float]] = field(default_factory=list)
-
-    @property
-    def key(self) -> tuple[str, str, float]:
-        """What tells it from the others."""
-        return self.data_set, self.method, self.rate
-
-    def add(
-        self, updates: int, seconds: float, scores: Sequence[list[float] | None], bias: Sequence[list[float]]
-    ) -> None:
-        """Append a measurement: the scores with those by reverse AIS, cosines and errors."""
-        values, reverse = scores
-        assert values is not None
-        self.updates.append(updates)
-        self.seconds.append(seconds)
-        self.scores.append(values)
-        if reverse is not None:
-            self.reverse.append(reverse)
-        for kept, new in zip((self.cosines, self.errors), bias, strict=True):
-            kept.append(new)
+    label: str
+    overrides: list[str]
+    passes: int
+    measure: str
+    methods: list[str] | None = None
+    rates: list[float] | None = None
+    replicas: int | None = None
+    choosing: int | None = None
+    points: int | None = None
 
 
-class Courses(JsonLines[Course]):
-    """Courses of a folder, ``courses.jsonl``."""
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A sampler with its settings.
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder / "courses.jsonl", Course)
+    Attributes:
+        label: For people.
+        overrides: Of its runs.
+        longer: Times as many passes as usual, > 0.
+        rates: Learning rates that are tried, unless the data set names some.
+        greedy_start: Share of the passes that is spent on greedy pretraining first, in [0, 1).
+    """
+
+    label: str
+    overrides: list[str]
+    longer: float = 1.0
+    rates: list[float] | None = None
+    greedy_start: float = 0.0
 
 
-def weights_path(folder: Path, course: Course) -> Path:
-    """Final weights of a course: a state dict of the RBM with its replicas, the reported ones first."""
-    return folder / "weights" / f"{course.data_set}-{course.method}-{course.rate:g}.pt"
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What is compared: the settings of ``conf/worth``.
+
+    Attributes:
+        name: Of the configuration.
+        title: For people.
+        replicas: Seeds that are reported, >= 1.
+        choosing: Further seeds that choose the learning rate, >= 1.
+        rates: Learning rates that are tried.
+        points: Measurements along a training, evenly spaced in the logarithm of the updates, >= 1.
+        gradient_draws: Draws of the negative phase whose mean gradient is compared with the exact one, >= 1.
+        only: Names of the data sets to train on; None for all.
+        data_sets: By name.
+        methods: By name.
+        claimed: Methods that are judged.
+        baselines: Methods that they are judged against.
+        workers: Processes; None is one for each core.
+    """
+
+    name: str
+    title: str
+    replicas: int
+    choosing: int
+    rates: list[float]
+    points: int
+    gradient_draws: int
+    only: list[str] | None
+    data_sets: dict[str, DataSet]
+    methods: dict[str, Method]
+    claimed: list[str]
+    baselines: list[str]
+    workers: int | None
+
+    def __post_init__(self) -> None:
+        for key in ("replicas", "choosing", "points", "gradient_draws"):
+            require_count(f"worth.{key}", getattr(self, key))
+        _require_some("worth.rates", self.rates, "at least one learning rate")
+        _require_some("worth.only", self.only, "names of data sets, or null for all")
+        for name in self.only or ():
+            require_choice("worth.only", name, tuple(self.data_sets))
+        for name in (*self.claimed, *self.baselines):
+            require_choice("worth.claimed and worth.baselines", name, tuple(self.methods))
+        for name, data_set in self.data_sets.items():
+            at = f"worth.data_sets.{name}"
+            require_choice(f"{at}.measure", data_set.measure, tuple(MEASURES))
+            require_count(f"{at}.passes", data_set.passes)
+            for key in ("replicas", "choosing", "points"):
+                require_count(f"{at}.{key}", 1 if getattr(data_set, key) is None else getattr(data_set, key))
+            for key in ("methods", "rates"):
+                _require_some(f"{at}.{key}", getattr(data_set, key), "at least one, or leave it out")
+            for known in data_set.methods or ():
+                require_choice(f"{at}.methods", known, tuple(self.methods))
+        for name, method in self.methods.items():
+            at = f"worth.methods.{name}"
+            require(method.longer > 0, f"{at}.longer", method.longer, "a number > 0")
+            require(0 <= method.greedy_start < 1, f"{at}.greedy_start", method.greedy_start, "a share in [0, 1)")
+            _require_some(f"{at}.rates", method.rates, "at least one, or leave it out")
+
+    def n_reported(self, data_set: str) -> int:
+        """Replicas of a data set that are reported."""
+        return self.data_sets[data_set].replicas or self.replicas
+
+
+def _require_some(name: str, values: Sequence[Any] | None, allowed: str) -> None:
+    require(values is None or len(values) > 0, name, values, allowed)
 
 
 class End(NamedTuple):
@@ -92,50 +149,45 @@ class End(NamedTuple):
 
 
 class Worth:
-    """The courses of a folder, each method at the learning rate that other replicas than the reported chose."""
+    """The records of a comparison: each method at the learning rate that held-out data choose."""
 
-    def __init__(self, plan: dict[str, Any], courses: Sequence[Course]) -> None:
+    def __init__(self, plan: Comparison, records: Sequence[Record]) -> None:
         self.plan = plan
-        self._courses: dict[tuple[str, str], list[Course]] = {}
-        for course in courses:
-            if course.data_set in plan["data_sets"] and course.method in plan["methods"]:
-                self._courses.setdefault((course.data_set, course.method), []).append(course)
+        self._records: dict[tuple[str, str], list[Record]] = {}
+        for record in records:
+            if record.data_set in plan.data_sets and record.method in plan.methods:
+                self._records.setdefault((record.data_set, record.method), []).append(record)
 
     @property
     def data_sets(self) -> list[str]:
         """Those of which something was measured."""
-        return [name for name in self.plan["data_sets"] if any(found == name for found, _ in self._courses)]
+        return [name for name in self.plan.data_sets if any(found == name for found, _ in self._records)]
 
     def methods(self, data_set: str) -> list[str]:
         """Those that were measured on a data set, in the order of the legend."""
-        return [name for name in self.plan["methods"] if (data_set, name) in self._courses]
-
-    def n_reported(self, data_set: str) -> int:
-        """Replicas of a data set that are reported."""
-        n: int = self.plan["data_sets"][data_set].get("replicas", self.plan["replicas"])
-        return n
+        return [name for name in self.plan.methods if (data_set, name) in self._records]
 
     def rates(self, data_set: str, method: str) -> list[float]:
         """Learning rates that were tried."""
-        return sorted(course.rate for course in self._courses[data_set, method])
+        return sorted(record.value or 0.0 for record in self._records[data_set, method])
 
-    def best(self, data_set: str, method: str) -> Course:
-        """The course of lowest median at the end, by the replicas that choose."""
-        return min(self._courses[data_set, method], key=self._chosen_by)
+    def best(self, data_set: str, method: str) -> Record:
+        """The record of the learning rate that held-out data choose."""
+        found = best(self._records[data_set, method])
+        assert found is not None
+        return found
 
-    def values(self, course: Course, name: str = "scores") -> NDArray[np.float64]:
-        """``(n_points, replicas)`` of the replicas that are reported."""
-        return np.array(getattr(course, name), dtype=float)[:, : self.n_reported(course.data_set)]
-
-    def _chosen_by(self, course: Course) -> float:
-        return float(np.median(course.scores[-1][self.n_reported(course.data_set) :]))
+    def values(self, record: Record, name: str = "score") -> NDArray[np.float64]:
+        """A measure of the replicas that are reported, ``(n_points, replicas)``."""
+        return record.measured(name)[:, : self.plan.n_reported(record.data_set)]
 
     def end(self, data_set: str, method: str) -> End:
         """What is reported of a method."""
-        course = self.best(data_set, method)
-        scores = self.values(course)[-1]
-        reverse = float(np.median(self.values(course, "reverse")[-1])) if course.reverse else None
-        return End(course.rate, float(np.median(scores)), float(scores.max()), reverse, course.seconds[-1])
+        record = self.best(data_set, method)
+        scores = self.values(record)[-1]
+        reverse = float(np.median(self.values(record, "reverse")[-1])) if "reverse" in record.measures else None
+        rate = record.value or 0.0
+        return End(rate, float(np.median(scores)), float(scores.max()), reverse, record.seconds[-1])
 
     def opponent(self, data_set: str, method: str) -> str | None:
         """The best baseline, by the replicas that choose, of those that take at most a tenth more time.
@@ -144,15 +196,15 @@ class Worth:
         """
         seconds = {
             name: self.end(data_set, name).seconds
-            for name in self.plan["baselines"]
+            for name in self.plan.baselines
             if name in self.methods(data_set)
         }
         if not seconds:
             return None
         limit = max(1.1 * self.end(data_set, method).seconds, min(seconds.values()))
         able = [name for name in seconds if seconds[name] <= limit]
-        best: str = min(able, key=lambda name: self._chosen_by(self.best(data_set, name)))
-        return best
+        found = best(self.best(data_set, name) for name in able)
+        return None if found is None else found.method
 
 
 WORTH_RULE = (
@@ -168,7 +220,7 @@ def worth_verdicts(worth: Worth) -> list[Verdict]:
     pairs = [
         (data_set, method, opponent)
         for data_set in worth.data_sets
-        for method in worth.plan["claimed"]
+        for method in worth.plan.claimed
         if method in worth.methods(data_set) and (opponent := worth.opponent(data_set, method)) is not None
     ]
     scores = [tuple(worth.values(worth.best(pair[0], name))[-1] for name in pair[1:]) for pair in pairs]
@@ -180,9 +232,9 @@ def _verdict(worth: Worth, data_set: str, method: str, opponent: str, p: float) 
     mine, other = worth.end(data_set, method), worth.end(data_set, opponent)
     better = mine.median < other.median and p < 0.05 and mine.worst <= other.worst
     measured = f"{mine.median:.4g} (worst {mine.worst:.4g}) against {other.median:.4g} ({other.worst:.4g})"
-    label, against = (worth.plan["methods"][name]["label"] for name in (method, opponent))
+    label, against = (worth.plan.methods[name].label for name in (method, opponent))
     return Verdict(
-        f"{worth.plan['data_sets'][data_set]['label']}: {label} beats {against}",
+        f"{worth.plan.data_sets[data_set].label}: {label} beats {against}",
         f"median {measured}",
         f"{mine.seconds:.1f} s and {other.seconds:.1f} s, p = {p:.2g}",
         HOLDS if better else FAILS,
@@ -208,14 +260,12 @@ def worth_table(worth: Worth) -> list[list[str]]:
     rows = [[*header, "us an update and replica"]]
     for data_set in worth.data_sets:
         for method in worth.methods(data_set):
-            end, course = worth.end(data_set, method), worth.best(data_set, method)
-            each = 1e6 * end.seconds / course.updates[-1] / len(course.scores[-1])
+            end, record = worth.end(data_set, method), worth.best(data_set, method)
+            each = 1e6 * end.seconds / record.at[-1] / len(record.measures["score"][-1])
             tried = " ".join(f"{rate:g}" for rate in worth.rates(data_set, method))
             reverse = "" if end.reverse is None else f"{end.reverse:.4g}"
             cells = [tried, f"{end.median:.4g}", f"{end.worst:.4g}", reverse, f"{end.seconds:.1f}", f"{each:.1f}"]
-            labels = [
-                worth.plan[kind][name]["label"] for kind, name in (("data_sets", data_set), ("methods", method))
-            ]
+            labels = (worth.plan.data_sets[data_set].label, worth.plan.methods[method].label)
             rows.append([*labels, f"{end.rate:g}", *cells])
     return rows
 
@@ -229,4 +279,11 @@ def read_worth(folder: Path) -> Worth:
     path = folder / "worth.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no worth.json: name the folder of experiment=sampler_worth.")
-    return Worth(json.loads(path.read_text(encoding="utf-8")), Courses(folder).all)
+    return Worth(comparison_of(json.loads(path.read_text(encoding="utf-8"))), Records(folder).all)
+
+
+def comparison_of(settings: Mapping[str, Any]) -> Comparison:
+    """From the plain values of ``worth.json``."""
+    data_sets = {name: DataSet(**values) for name, values in settings["data_sets"].items()}
+    methods = {name: Method(**values) for name, values in settings["methods"].items()}
+    return Comparison(**{**settings, "data_sets": data_sets, "methods": methods})

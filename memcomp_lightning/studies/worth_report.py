@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from memcomp_lightning.files import write_text
 from memcomp_lightning.studies.event_files import event_file
+from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.page import markdown
 from memcomp_lightning.studies.plot_worth import plot_worth
 from memcomp_lightning.studies.verdicts import Verdict
@@ -20,12 +21,6 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 NUMBERS = "sampler_worth.csv"
-MEASURED = {
-    "kl": "KL divergence, nats",
-    "log_likelihood": "negative log-likelihood, nats",
-    "ais": "negative log-likelihood by AIS, nats",
-}
-"""What a measure is called in charts."""
 
 
 def write_worth(worth: Worth, folder: Path) -> tuple[dict[str, Figure], list[Verdict], list[str]]:
@@ -48,20 +43,20 @@ def _write_events(worth: Worth, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     charts = {}
     for data_set in worth.data_sets:
-        settings = worth.plan["data_sets"][data_set]
-        measure = settings["measure"]
-        name = MEASURED[measure]
+        settings = worth.plan.data_sets[data_set]
+        measure = settings.measure
+        name = MEASURES[measure].title
         tags = {
             f"{name}: median over replicas": [f"{data_set}/{measure}/median"],
             f"{name}: worst replica": [f"{data_set}/{measure}/worst"],
             "gradient: cosine with the exact one": [f"{data_set}/gradient/cosine"],
             "gradient: relative error": [f"{data_set}/gradient/relative_error"],
         }
-        charts[settings["label"]] = {title: ["Multiline", names] for title, names in tags.items()}
-    for method, settings in worth.plan["methods"].items():
+        charts[settings.label] = {title: ["Multiline", names] for title, names in tags.items()}
+    for method, own in worth.plan.methods.items():
         found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
         if found:
-            with event_file(folder / settings["label"]) as writer:
+            with event_file(folder / own.label) as writer:
                 if writer is not None:
                     _write_method(worth, method, found, writer)
     with event_file(folder) as writer:
@@ -72,25 +67,26 @@ def _write_events(worth: Worth, folder: Path) -> None:
 def _write_method(worth: Worth, method: str, data_sets: list[str], writer: "SummaryWriter") -> None:
     from torch.utils.tensorboard.summary import hparams
 
-    settings, final = {"method": worth.plan["methods"][method]["label"]}, {}
+    settings: dict[str, Any] = {"method": worth.plan.methods[method].label}
+    final = {}
     for data_set in data_sets:
-        course, measure = worth.best(data_set, method), worth.plan["data_sets"][data_set]["measure"]
-        scores, cosines, errors = (worth.values(course, name) for name in ("scores", "cosines", "errors"))
+        record, measure = worth.best(data_set, method), worth.plan.data_sets[data_set].measure
+        scores, cosines, errors = (worth.values(record, name) for name in ("score", "cosine", "relative_error"))
         values = {
             f"{data_set}/{measure}/median": np.median(scores, axis=1),
             f"{data_set}/{measure}/worst": scores.max(axis=1),
             f"{data_set}/gradient/cosine": np.median(cosines, axis=1),
             f"{data_set}/gradient/relative_error": np.median(errors, axis=1),
-            f"{data_set}/seconds": np.array(course.seconds),
+            f"{data_set}/seconds": np.array(record.seconds),
         }
         for tag, curve in values.items():
-            for updates, value in zip(course.updates, curve, strict=True):
+            for updates, value in zip(record.at, curve, strict=True):
                 writer.add_scalar(tag, value, updates)
         end = worth.end(data_set, method)
         settings[f"learning_rate/{data_set}"] = end.rate
         for name in ("median", "worst", "seconds"):
             final[f"final/{data_set}/{name}"] = getattr(end, name)
-            writer.add_scalar(f"final/{data_set}/{name}", getattr(end, name), course.updates[-1])
+            writer.add_scalar(f"final/{data_set}/{name}", getattr(end, name), record.at[-1])
     file_writer: Any = writer.file_writer
     for summary in hparams(settings, final):
         file_writer.add_summary(summary)

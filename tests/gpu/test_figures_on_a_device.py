@@ -46,8 +46,8 @@ def test_the_same_command_gives_the_same_figure(
         monkeypatch.setattr(accuracy, "device_of", lambda accelerator, place=place: torch.device(place))
         GlobalHydra.instance().clear()
         train.main()
-        found[place] = {record.key: record.scores for record in Records(Path(place)).all}
-    assert {key[0] for key in found["cpu"]} >= set(CURVES)
+        found[place] = {record.key: record.measures for record in Records(Path(place)).all}
+    assert {key[1] for key in found["cpu"]} >= set(CURVES)
     if device == stand_in.NAME:
         assert stand_in.waits
         assert found[device] == found["cpu"]

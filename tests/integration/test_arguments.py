@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hydra import initialize_config_module
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from running import Outcome
@@ -15,8 +14,8 @@ import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.cli import arguments
 from memcomp_lightning.cli.arguments import from_folder, read, with_path
-from memcomp_lightning.cli.hydra_versions import INITIALIZE
-from memcomp_lightning.cli.overrides import CONFIG_MODULE, _check_options
+from memcomp_lightning.cli.overrides import _check_options
+from memcomp_lightning.configuration.composing import composing
 from memcomp_lightning.errors import UserError
 
 Run = Callable[..., Outcome]
@@ -249,7 +248,7 @@ def test_groups_are_added_and_taken_away_in_no_way() -> None:
         typed |= {f"+{group}={option}": group, f"++{group}={option}": group, f"{group}=3": group}
         typed |= {f"~{group}={option}": group} if group not in NOT_NEEDED else {}
     typed |= {"~seed": "seed", "sampler={k:1}": "sampler", "callbacks=null": "callbacks"}
-    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+    with composing():
         for argument, group in typed.items():
             with pytest.raises(UserError, match=re.escape(f"{argument} is not possible: {group} ")):
                 _check_options([argument], "config", [])

@@ -39,8 +39,9 @@ def test_lengths_of_training_can_be_chosen(memcomp_train: Run) -> None:
 def test_the_choice_of_an_interrupted_run_stands(memcomp_train: Run) -> None:
     small = [*FAST, "sampler=cd", RATES, "hydra.run.dir=run"]
     assert memcomp_train(*small).status == 0
-    path = Path("run/choice.json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), "value": 1e-9}))
+    path = Path("run/choice.jsonl")
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps({**r, "held_out": float(r["value"] == 1e-9)}) + "\n" for r in records))
     Path("run/result.json").unlink()
     Path("run/stages.json").unlink()
     assert memcomp_train("resume=run").status == 0
@@ -50,7 +51,7 @@ def test_the_choice_of_an_interrupted_run_stands(memcomp_train: Run) -> None:
 def test_every_job_of_a_sweep_chooses_for_itself(memcomp_train: Run) -> None:
     outcome = memcomp_train("-m", *FAST, "control=cd_best_rate", "seed=0,1", "hydra.sweep.dir=sweep")
     assert outcome.status == 0, outcome.err
-    assert len(list(Path("sweep").glob("*/choice.json"))) == 2
+    assert len(list(Path("sweep").glob("*/choice.jsonl"))) == 2
     assert Path("sweep/table.csv").exists()
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from hydra import compose
 from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
-from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.hydra_versions import INITIALIZE
+from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.plans import build
 
 Run = Callable[..., Outcome]
 CONF = Path(memcomp_lightning.__file__).parent / "conf"
@@ -46,7 +46,7 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
     small = [*FAST, "sampler=mode_assisted_cd", "pretrain.iterations=3"]
     for batch_size, n_updates in (("null", 3), ("500", 9)):
         overrides = [*small, f"pretrain.batch_size={batch_size}"]
-        with initialize_config_module("memcomp_lightning.conf", **INITIALIZE):
+        with composing():
             plan = build(compose("config", overrides))
         assert plan.pretraining is not None
         assert plan.pretraining.module.sampler.schedule.n_updates == n_updates  # type: ignore[attr-defined]

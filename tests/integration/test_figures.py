@@ -14,9 +14,11 @@ import pytest
 import torch
 from running import HANGS_AFTER, QUIET, Outcome
 
-from memcomp_lightning.cli import figures, report
+from memcomp_lightning.cli import report
 from memcomp_lightning.cli.commands import report as pages
+from memcomp_lightning.configuration import composing
 from memcomp_lightning.studies import Records
+from memcomp_lightning.studies.results import at_best_validation
 
 Run = Callable[..., Outcome]
 
@@ -83,10 +85,10 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         assert single.status == 0, single.err
         result = json.loads(Path(f"single_{name}/result.json").read_text())
         (record,) = [r for r in found.of(name) if (r.iterations, r.seed) == (3, 5)]
-        assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
-        assert record.scores["test_accuracy"][1] == pytest.approx(result["test_accuracy"], abs=1e-9)
+        assert record.measures["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+        assert record.measures["test_accuracy"][1] == pytest.approx(result["test_accuracy"], abs=1e-9)
         (other,) = [r for r in found.of(name) if (r.iterations, r.seed) == (1, 5)]
-        assert record.scores["test_loss"][1] != pytest.approx(other.scores["test_loss"][1], rel=1e-5)
+        assert record.measures["test_loss"][1] != pytest.approx(other.measures["test_loss"][1], rel=1e-5)
 
 
 @pytest.mark.usefixtures("no_pages")
@@ -99,12 +101,12 @@ def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, pl
     figure = ["experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[2]", curve, "hydra.run.dir=run"]
     outcome = memcomp_train(place, *figure)
     assert outcome.status == 0, outcome.err
-    losses = only(records(), "mine", 2).scores["test_loss"]
-    assert losses != only(records(), "cd1", 2).scores["test_loss"]
+    losses = only(records(), "mine", 2).measures["test_loss"]
+    assert losses != only(records(), "cd1", 2).measures["test_loss"]
     Path("run/records.jsonl").unlink()
     outcome = memcomp_train("resume=run")
     assert outcome.status == 0, outcome.err
-    assert only(records(), "mine", 2).scores["test_loss"] == losses
+    assert only(records(), "mine", 2).measures["test_loss"] == losses
 
 
 @pytest.mark.usefixtures("no_pages")
@@ -120,7 +122,7 @@ def test_a_replica_trained_jointly_is_the_single_run(memcomp_train: Run, sampler
     assert single.status == 0, single.err
     result = json.loads(Path("single/result.json").read_text())
     record = only(records(), "joint", 3)
-    assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+    assert record.measures["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
 
 
 def test_a_sweep_of_single_runs_gives_the_same_table(memcomp_train: Run) -> None:
@@ -194,10 +196,10 @@ def test_a_control_in_a_figure_is_the_control_of_a_single_run(
     result = json.loads(Path("single/result.json").read_text())
     record = only(controls, control, CONTROLS[control])
     if control == "bn_relu_regularised":  # the single run keeps the pass that was best on held-out images
-        assert record.at_best_validation()[1] == pytest.approx(result["test_accuracy"], abs=1e-9)
+        assert at_best_validation(record)[1] == pytest.approx(result["test_accuracy"], abs=1e-9)
     else:
-        assert record.scores["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
-    assert record.choice == result.get("choice", {"value": None})["value"]
+        assert record.measures["test_loss"][1] == pytest.approx(result["test_loss"], rel=1e-5)
+    assert record.value == result.get("choice", {"value": None})["value"]
 
 
 FIGURE = [
@@ -231,7 +233,7 @@ def test_a_figure_is_trained_reported_and_resumed(memcomp_train: Run) -> None:
     assert "http" not in page.replace("https://", "http", 0).split("<body>")[1].split("base64")[0]
     lines = Path("run/records.jsonl").read_text().splitlines()
     # What was chosen on held-out images is trained anew on all of them.
-    assert {record.choice for record in records().all if record.curve == "pcd_best_rate" and record.choosing} == {
+    assert {record.value for record in records().all if record.method == "pcd_best_rate" and record.choosing} == {
         0.05, 0.1, 0.2, 0.5, 1.0, 2.0,
     }  # fmt: skip
     assert len(records().of("pcd_best_rate")) == 1
@@ -245,7 +247,7 @@ def test_a_figure_is_trained_reported_and_resumed(memcomp_train: Run) -> None:
 
     def measured(text: list[str]) -> list[Any]:
         parsed = [json.loads(line) for line in text]
-        return sorted((r["curve"], str(r["choice"]), r["iterations"], r["scores"]["test_loss"]) for r in parsed)
+        return sorted((r["method"], str(r["value"]), r["iterations"], r["measures"]["test_loss"]) for r in parsed)
 
     assert measured(again) == measured(lines)
 
@@ -299,8 +301,8 @@ def test_a_curve_is_composed_once(memcomp_train: Run, monkeypatch: pytest.Monkey
         composed.append(tuple(overrides))
         return hydra.compose(name, overrides)
 
-    monkeypatch.setattr(figures, "compose", counted)
-    figures._composed.cache_clear()
+    monkeypatch.setattr(composing, "compose", counted)
+    composing._composed.cache_clear()
     outcome = memcomp_train(
         "experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"
     )
@@ -333,7 +335,7 @@ def test_all_figures_end_in_one_report(memcomp_train: Run) -> None:
         assert Path("run", figure, f"{figure}.svg").stat().st_size > 0
         assert f"<h2>{figure}: digits" in page
     assert {record.seed for record in records("run/figure5").all} == {0}
-    assert [len(record.scores["test_loss"][0]) for record in records("run/figure5").of("cd1")] == [
+    assert [len(record.measures["test_loss"][0]) for record in records("run/figure5").of("cd1")] == [
         1,
         1,
     ]  # all images
@@ -345,7 +347,7 @@ def test_other_readings_of_the_paper_in_one_table(memcomp_train: Run) -> None:
     assert "Mem-QUBO, binary inputs is above CD-1, binary inputs at N = 2 (after 2 passes)" in outcome.out
     assert not Path("run/readings.png").exists()  # one pretraining length is no curve
     assert Path("run/readings_controls.png").stat().st_size > 0
-    losses = {record.curve: record.scores["test_loss"][1][0] for record in records().all}
+    losses = {record.method: record.measures["test_loss"][1][0] for record in records().all}
     assert len(set(losses.values())) == len(losses) == 17  # every setting does something
 
 
@@ -355,7 +357,7 @@ def test_an_annealer_in_the_place_of_the_dmm(memcomp_train: Run) -> None:
     outcome = memcomp_train("experiment=annealer", *TINY, "figure.iterations=[2]", "figure.controls_at=[2]", curve)
     assert outcome.status == 0, outcome.err
     assert "annealer (simulated annealing, 100 reads) is above CD-1 at N = 2" in outcome.out
-    losses = {record.curve: record.scores["test_loss"][1][0] for record in records().all}
+    losses = {record.method: record.measures["test_loss"][1][0] for record in records().all}
     assert len(set(losses.values())) == len(losses) == 7
 
 
@@ -377,7 +379,7 @@ def test_figures_train_in_processes_of_their_own(memcomp_train: Run) -> None:
     assert memcomp_train(*small, "figure.workers=2", "hydra.run.dir=apart").status == 0
 
     def losses(folder: str) -> dict[Any, Any]:
-        return {record.key: record.scores["test_loss"] for record in records(folder).all}
+        return {record.key: record.measures["test_loss"] for record in records(folder).all}
 
     here, apart = losses("here"), losses("apart")
     assert here.keys() == apart.keys()
@@ -394,7 +396,7 @@ def test_a_value_that_diverges_is_not_chosen_and_a_curve_that_does_is_named(memc
     small.append("figure.claims=[{better:x,than:x}]")
     outcome = memcomp_train(*small, curve % "[1e30,0.1]", "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
-    assert records().best_choice("x") == 0.1
+    assert records().best_value("x") == 0.1
     outcome = memcomp_train(*small, curve % "[1e30]", "hydra.run.dir=other")
     assert outcome.status != 0
     assert "figure.curves.x: pretraining, layer 1: weight has an entry of" in outcome.err

@@ -30,7 +30,8 @@ from memcomp_lightning.samplers import (
     ModeSchedule,
 )
 from memcomp_lightning.solvers import BruteForce
-from memcomp_lightning.studies.worth import Courses, weights_path
+from memcomp_lightning.studies import Records
+from memcomp_lightning.studies.likelihood import weights_path
 from memcomp_lightning.training import Boltzmann, Joint
 
 Run = Callable[..., Outcome]
@@ -238,10 +239,10 @@ def test_deep_and_full_machines_are_compared_by_their_likelihood(memcomp_train: 
         "joint_pcd_greedy_start": DBM(9, [6, 6], replicas=(3,)),
         "full_mode_dmm": BoltzmannMachine(9, 5, replicas=(3,)),
     }
-    courses = Courses(Path("run")).all
-    assert [course.method for course in courses] == methods
-    for course in courses:
-        assert course.updates[-1] == 20
-        model = models[course.method]
-        model.load_state_dict(torch.load(weights_path(Path("run"), course), weights_only=True))
-        assert course.scores[-1] == pytest.approx(kl_divergence(model, v).tolist(), rel=1e-5)
+    found = Records(Path("run")).all
+    assert [record.method for record in found] == methods
+    for record in found:
+        assert record.at[-1] == 20
+        model = models[record.method]
+        model.load_state_dict(torch.load(weights_path(Path("run"), record), weights_only=True))
+        assert record.measures["score"][-1] == pytest.approx(kl_divergence(model, v).tolist(), rel=1e-5)

@@ -20,11 +20,12 @@ from numba import njit
 from running import Outcome
 
 from memcomp_lightning import compiling
-from memcomp_lightning.cli import trainers
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
-from memcomp_lightning.cli.output import compilation_told, say, tolerant_streams
+from memcomp_lightning.cli.output import say, tolerant_streams
 from memcomp_lightning.cli.overrides import claimed
+from memcomp_lightning.compiling import told
+from memcomp_lightning.configuration import trainers
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.studies import report as study_report
@@ -363,7 +364,7 @@ def unannounced() -> None:
 def test_compilation_is_said_in_one_line(capfd: pytest.CaptureFixture[str]) -> None:
     of = "memcomp_lightning.solvers"
     one, other = kernel(f"{of}.dmm.kernels.rows"), kernel(f"{of}.kernels.branch_and_bound")
-    with compilation_told("memcomp-train"):
+    with told(lambda text: say(f"memcomp-train: {text}", error=True)):
         kernel("of.others")(1)
         assert capfd.readouterr().err == ""
         one(1)

@@ -15,7 +15,7 @@ import yaml
 from omegaconf import OmegaConf
 from running import FAST, Outcome, Program
 
-from memcomp_lightning.cli.hydra_versions import IS_1_3
+from memcomp_lightning.configuration.hydra_versions import IS_1_3
 
 Run = Callable[..., Outcome]
 SEARCH = ["-m", "hparams=pretraining", "sampler=cd", "callbacks=minimal", *FAST, "hydra.sweep.dir=search"]

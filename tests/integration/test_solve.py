@@ -138,10 +138,10 @@ def test_unused_variables_are_free(memcomp_solve: Solve) -> None:
 def test_memory_is_said_before_solving(memcomp_solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("path.coo").write_text("".join(f"{i} {i + 1} -1\n" for i in range(50)))
     restarts = ["solver=alternating_descent", "solver.n_restarts=10", "solver.max_sweeps=1", FAST[2]]
-    monkeypatch.setattr("memcomp_lightning.cli.commands.solve._NUMBERS_EACH", 135_000)
+    monkeypatch.setattr("memcomp_lightning.solvers.solving._NUMBERS_EACH", 135_000)
     outcome = memcomp_solve("problem=path.coo", *restarts)
     assert "Note: The solver needs about 1 GiB of memory." in outcome.out
-    monkeypatch.setattr("memcomp_lightning.cli.commands.solve._installed", lambda: float(2**29))
+    monkeypatch.setattr("memcomp_lightning.solvers.solving._installed", lambda: float(2**29))
     outcome = memcomp_solve("problem=path.coo", *restarts)
     assert outcome.status == 2
     for part in ("path.coo: 51 variables, 50 couplings", "n_restarts = 10 needs about 1 GiB", "fewer restarts"):

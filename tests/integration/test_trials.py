@@ -5,12 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from hydra import compose
 from running import QUIET, Outcome
 
-from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.hydra_versions import INITIALIZE
-from memcomp_lightning.cli.overrides import CONFIG_MODULE
+from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.modules import Classifier
 from memcomp_lightning.studies.accuracy import pretrained
 from memcomp_lightning.training import finetune
@@ -59,7 +58,7 @@ def test_a_loop_without_a_trainer_ends_with_the_weights_of_the_run(memcomp_train
     outcome = memcomp_train(*overrides, "hydra.run.dir=run")
     assert outcome.status == 0, outcome.err
     expected = torch.load("run/weights/finetune.pt", weights_only=True)
-    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+    with composing():
         config = compose("config", overrides)
         plan = pretrained(build(config), config.seed, torch.device("cpu"))
     assert plan.finetuning is not None

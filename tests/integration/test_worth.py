@@ -1,10 +1,9 @@
-"""``experiment=sampler_worth`` in small: courses, resume, report, TensorBoard."""
+"""``experiment=sampler_worth`` in small: records, resume, report, TensorBoard."""
 
 import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from running import Outcome
@@ -17,8 +16,10 @@ from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_part
 from memcomp_lightning.models import DBN, RBM, Gaussian
 from memcomp_lightning.samplers import Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
 from memcomp_lightning.solvers import BruteForce
+from memcomp_lightning.studies import Record, Records
+from memcomp_lightning.studies.likelihood import weights_path
 from memcomp_lightning.studies.measures.gradient_bias import mean_gradient
-from memcomp_lightning.studies.worth import Courses, read_worth, weights_path
+from memcomp_lightning.studies.worth import read_worth
 
 Run = Callable[..., Outcome]
 KEPT = ("cd1", "cd1_long", "exact", "mode_cd_exact")
@@ -40,6 +41,10 @@ SMALL = [
 ]
 
 
+def records() -> list[Record]:
+    return Records(Path("run")).all
+
+
 def test_a_sampler_of_ones_own_is_a_method(memcomp_train: Run, tmp_path: Path) -> None:
     (tmp_path / "confs/sampler").mkdir(parents=True)
     (tmp_path / "confs/sampler/mine.yaml").write_text("_target_: memcomp_lightning.samplers.CD\nk: 3\n")
@@ -49,39 +54,41 @@ def test_a_sampler_of_ones_own_is_a_method(memcomp_train: Run, tmp_path: Path) -
     outcome = memcomp_train("--config-dir=confs", *settings, own, *methods)
     assert outcome.status == 0, outcome.err
     assert "mine beats CD-1" in outcome.out
-    assert {course.method for course in Courses(Path("run")).all} == {"cd1", "mine"}
+    assert {record.method for record in records()} == {"cd1", "mine"}
 
 
 def test_methods_are_trained_measured_resumed_and_reported(memcomp_train: Run) -> None:
     outcome = memcomp_train(*SMALL)
     assert outcome.status == 0, outcome.err
     assert "mode-assisted CD-1, exact mode beats" in outcome.out
-    courses = Courses(Path("run")).all
-    assert {course.key for course in courses} == {("shifting_bars", m, r) for m in KEPT for r in (0.1, 0.5)}
-    for course in courses:
-        n_passes = 120 if course.method == "cd1_long" else 40
-        assert (course.updates[0], course.updates[-1], len(course.updates)) == (1, n_passes, 4)
-        assert all(len(scores) == 5 for scores in course.scores)
-        assert course.seconds == sorted(course.seconds)
-        weights = torch.load(weights_path(Path("run"), course), weights_only=True)
+    found = records()
+    tried = {("shifting_bars", method, rate) for method in KEPT for rate in (0.1, 0.5)}
+    assert {(record.data_set, record.method, record.value) for record in found} == tried
+    for record in found:
+        n_passes = 120 if record.method == "cd1_long" else 40
+        assert (record.at[0], record.at[-1], len(record.at)) == (1, n_passes, 4)
+        assert all(len(scores) == 5 for scores in record.measures["score"])
+        assert record.seconds == sorted(record.seconds)
+        assert record.held_out == -sum(record.measures["score"][-1][3:]) / 2
+        weights = torch.load(weights_path(Path("run"), record), weights_only=True)
         assert [tuple(value.shape) for value in weights.values()] == [(5, 18, 9), (5, 9), (5, 18)]
-        exact = course.method == "exact"
-        assert all((error < 1e-6) == exact for error in course.errors[0])
+        exact = record.method == "exact"
+        assert all((error < 1e-6) == exact for error in record.measures["relative_error"][0])
 
-    path = Path("run/courses.jsonl")
+    path = Path("run/records.jsonl")
     path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
     assert memcomp_train("resume=run").status == 0
-    again = Courses(Path("run")).all
-    assert again[-1].key == courses[-1].key
-    assert again[-1].scores == courses[-1].scores
+    again = records()
+    assert again[-1].key == found[-1].key
+    assert again[-1].measures["score"] == found[-1].measures["score"]
 
     for name in ("shifting_bars.png", "shifting_bars.svg", "sampler_worth.csv", "verdicts.md", "report.html"):
         assert Path("run", name).stat().st_size > 0
     events = EventAccumulator("run/tensorboard/CD-1").Reload()
     median = events.Scalars("shifting_bars/kl/median")
     best = read_worth(Path("run")).best("shifting_bars", "cd1")
-    assert [event.step for event in median] == best.updates
-    assert median[-1].value == pytest.approx(sorted(best.scores[-1][:3])[1], rel=1e-6)
+    assert [event.step for event in median] == best.at
+    assert median[-1].value == pytest.approx(sorted(best.measures["score"][-1][:3])[1], rel=1e-6)
     assert any(b"method" in file.read_bytes() for file in Path("run/tensorboard/CD-1").rglob("events*"))
     layout = EventAccumulator("run/tensorboard").Reload()
     assert "custom_scalars__config__" in layout.Tags()["tensors"]
@@ -110,9 +117,9 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     assert single.status == 0, single.err
     dbn = DBN(9, [18])
     dbn.load_state_dict(torch.load("single/weights/pretrain.pt", weights_only=True))
-    (course,) = [c for c in Courses(Path("run")).all if (c.method, c.rate) == ("exact", 0.5)]
+    (record,) = [r for r in records() if (r.method, r.value) == ("exact", 0.5)]
     found = kl_divergence(dbn[0], ShiftingBars().load().train_v)
-    assert course.scores[-1][3] == pytest.approx(float(found), rel=1e-4)
+    assert record.measures["score"][-1][3] == pytest.approx(float(found), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -144,8 +151,8 @@ def test_wrong_settings_are_refused_before_training(memcomp_train: Run, override
 def test_divergence_is_a_result(memcomp_train: Run) -> None:
     outcome = memcomp_train(*SMALL, "worth.methods.cd1.rates=[1e30]")
     assert outcome.status == 0, outcome.err
-    (course,) = [c for c in Courses(Path("run")).all if c.method == "cd1"]
-    assert course.scores[-1] == [float("inf")] * 5
+    (record,) = [r for r in records() if r.method == "cd1"]
+    assert record.measures["score"][-1] == [float("inf")] * 5
     assert json.loads(Path("run/worth.json").read_text())["methods"]["cd1"]["rates"] == [1e30]
 
 
@@ -166,11 +173,12 @@ def test_likelihoods_are_chosen_by_held_out_images_and_bracketed(memcomp_train: 
         "worth.claimed=[]",
     )
     assert outcome.status == 0, outcome.err
-    exact, ais = Courses(Path("run")).all
-    assert np.shape(exact.scores) == np.shape(ais.reverse) == (2, 5)
-    assert exact.reverse == []
-    assert np.array(ais.scores) == pytest.approx(np.array(exact.scores), abs=0.1)
-    assert np.array(ais.reverse) == pytest.approx(np.array(exact.scores), abs=0.1)
+    exact, ais = records()
+    true = exact.measured("score")
+    assert true.shape == ais.measured("reverse").shape == (2, 5)
+    assert "reverse" not in exact.measures
+    assert ais.measured("score") == pytest.approx(true, abs=0.1)
+    assert ais.measured("reverse") == pytest.approx(true, abs=0.1)
 
     rbm = RBM(n_visible=32, n_hidden=8, replicas=(5,))
     rbm.load_state_dict(torch.load(weights_path(Path("run"), exact), weights_only=True))
@@ -178,7 +186,7 @@ def test_likelihoods_are_chosen_by_held_out_images_and_bracketed(memcomp_train: 
     assert module.validation is not None
     for v, at in ((module.images.test_v, slice(0, 3)), (module.validation[0], slice(3, 5))):
         score = -log_likelihood(rbm, v, log_partition_function(rbm)).mean(-1)
-        assert exact.scores[-1][at] == pytest.approx(score[at].tolist(), rel=1e-6)
+        assert true[-1][at] == pytest.approx(score[at].numpy(), rel=1e-6)
 
 
 def test_mean_gradient_of_mode_assistance_weighs_both_sides() -> None:

@@ -12,6 +12,7 @@ from memcomp_lightning.errors import SettingError
 from memcomp_lightning.studies import Claim, FigurePlan, Record, Records, Results, markdown, page, verdicts
 from memcomp_lightning.studies.comparison import compare
 from memcomp_lightning.studies.page import Section
+from memcomp_lightning.studies.results import at_best_validation
 from memcomp_lightning.studies.verdicts import HOLDS, horizontal_arrow, vertical_arrow
 
 CLAIM = Claim(better="mem", than="cd")
@@ -27,15 +28,12 @@ def record(curve, accuracy, iterations=5, **settings):
     """One network of seven partitions, tested after 10 and 20 passes."""
     accuracy = np.broadcast_to(np.asarray(accuracy, float).T, (7, 2)).T
     made = {
-        "curve": curve,
-        "choice": None,
-        "choosing": False,
+        "method": curve,
         "iterations": iterations,
         "seed": 0,
-        "passes": [10, 20],
-        "scores": {"test_accuracy": accuracy.tolist()},
-        "pretrain_s": 1.0,
-        "finetune_s": 2.0,
+        "at": [10, 20],
+        "seconds": [2.0, 3.0],
+        "measures": {"test_accuracy": accuracy.tolist()},
     }
     return Record(**{**made, **settings})
 
@@ -73,10 +71,10 @@ def test_comparison_is_the_paired_t_test():
 
 
 def test_records_come_back_and_an_unfinished_line_is_dropped(tmp_path):
-    first, second = record("cd", 0.3), record("mem", 0.4, choice=0.5, choosing=True)
+    first, second = record("cd", 0.3), record("mem", 0.4, value=0.5, choosing=True)
     Records(tmp_path).append([first, second])
     path = tmp_path / "records.jsonl"
-    path.write_text(path.read_text() + '{"curve": "me')
+    path.write_text(path.read_text() + '{"method": "me')
     assert Records(tmp_path).all == [first, second]
     assert len(path.read_text().splitlines()) == 2
     path.write_text("damaged\n" + path.read_text())
@@ -87,21 +85,21 @@ def test_records_come_back_and_an_unfinished_line_is_dropped(tmp_path):
 def test_choice_is_made_by_held_out_images_alone(tmp_path):
     def tried(value, validation, test):
         scores = {"test_accuracy": [[test] * 7] * 2, "validation_accuracy": [[validation] * 7] * 2}
-        return record("cd", test, choice=value, choosing=True, scores=scores)
+        return record("cd", test, value=value, choosing=True, measures=scores, held_out=validation)
 
     records = Records(tmp_path)
-    records.append([tried(0.1, 0.5, 0.9), tried(0.2, 0.6, 0.1), record("cd", 0.3, choice=0.1)])
-    assert records.best_choice("cd") == 0.2
+    records.append([tried(0.1, 0.5, 0.9), tried(0.2, 0.6, 0.1), record("cd", 0.3, value=0.1)])
+    assert records.best_value("cd") == 0.2
     assert records.of("cd") == []  # the chosen value has not been trained yet
-    records.append([record("cd", 0.4, choice=0.2)])
-    assert [r.scores["test_accuracy"][0][0] for r in records.of("cd")] == [0.4]
+    records.append([record("cd", 0.4, value=0.2)])
+    assert [r.measures["test_accuracy"][0][0] for r in records.of("cd")] == [0.4]
 
 
 def test_early_stopping_takes_the_test_accuracy_at_the_best_validation_so_far():
     validation = [[0.5, 0.7], [0.8, 0.6], [0.6, 0.9]]
     test = [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]
-    found = record("bn", 0.0, scores={"test_accuracy": test, "validation_accuracy": validation})
-    np.testing.assert_array_equal(found.at_best_validation(), [[0.1, 0.2], [0.3, 0.2], [0.3, 0.6]])
+    found = record("bn", 0.0, measures={"test_accuracy": test, "validation_accuracy": validation})
+    np.testing.assert_array_equal(at_best_validation(found), [[0.1, 0.2], [0.3, 0.2], [0.3, 0.6]])
 
 
 def test_arrows_are_measured(tmp_path):

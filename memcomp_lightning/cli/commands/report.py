@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from memcomp_lightning.cli.arguments import as_typed
-from memcomp_lightning.cli.errors import in_words, refuse
-from memcomp_lightning.cli.output import say
+from memcomp_lightning.cli.output import refuse, say
+from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.table import aligned, short_path

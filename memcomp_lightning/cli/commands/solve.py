@@ -1,10 +1,8 @@
 """``memcomp-solve``: look for the minimum of a problem that stands in a file."""
 
-import math
 import os
 import sys
 from collections import Counter
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,45 +11,22 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from memcomp_lightning import rng
 from memcomp_lightning.cli.arguments import read
-from memcomp_lightning.cli.errors import refuse
-from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
-from memcomp_lightning.cli.kinds import check_kinds
-from memcomp_lightning.cli.output import make_tolerant, say
-from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, check_finite, check_seed
-from memcomp_lightning.errors import SettingError, UserError, require, require_choice
+from memcomp_lightning.cli.output import make_tolerant, refuse, say
+from memcomp_lightning.cli.overrides import answering, check_command_line
+from memcomp_lightning.configuration.composing import CONFIG_MODULE
+from memcomp_lightning.configuration.hydra_versions import MAIN
+from memcomp_lightning.configuration.problems import prepare
+from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.plotting import plot_trajectory
-from memcomp_lightning.problems import (
-    FORMATS,
-    Bipartite,
-    Problem,
-    ProblemFileError,
-    Qubo,
-    WeightedMaxSat,
-    in_full,
-    read_problem,
-    to_qubo,
-)
+from memcomp_lightning.problems import Problem, ProblemFileError, in_full
 from memcomp_lightning.runs.table import short_path
-from memcomp_lightning.solvers import (
-    Answer,
-    BranchAndBound,
-    BruteForce,
-    QuboSolution,
-    QuboSolver,
-    Trajectory,
-    write_solution,
-)
-from memcomp_lightning.solvers.dmm import DmmSolver, default_steps
+from memcomp_lightning.solvers import Answer, QuboSolution, QuboSolver, Trajectory, write_solution
+from memcomp_lightning.solvers.solving import memory_needed, minimise
 
 COMMAND = "memcomp-solve"
 
-MOST_RECORDED = 4 * 2**30
-"""Bytes of a trajectory that a common computer's memory holds."""
-
-_SETTINGS = ("problem", "format", "maximise", "seed", "solver")
 _LONGEST_PRINTED = 100
 
 
@@ -64,116 +39,10 @@ def solve(config: DictConfig) -> None:
     try:
         problem, solver = prepare(config)
         say("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]))
-        solution = _minimise(problem, solver, config.seed)
+        solution = minimise(problem, solver, config.seed)
         _write(Path(settings.runtime.output_dir), config, problem, solution)
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
-
-
-def prepare(config: DictConfig) -> tuple[Problem, QuboSolver]:
-    """Read the file and build the solver; everything that can be refused is refused here.
-
-    Raises:
-        UserError, SettingError, ProblemFileError, InstantiationException: A setting does not exist or is out of
-            range, or the file cannot be read.
-    """
-    for name in config:
-        require_choice("setting", name, _SETTINGS)
-    check_finite(config)
-    check_kinds(config)
-    check_seed(config.seed)
-    require(isinstance(config.maximise, bool), "maximise", config.maximise, "true or false")
-    if not config.problem:
-        raise UserError(
-            f"problem=FILE is missing: name the file of a problem, as in {COMMAND} problem=G1.txt. Formats: "
-            f"{', '.join(FORMATS)}; {COMMAND} --help describes them."
-        )
-    solver: QuboSolver = instantiate(config.solver)
-    problem = _read(str(config.problem), config.format, config.maximise)
-    if not isinstance(solver, DmmSolver):
-        _as_qubo(problem.problem)
-    _check_memory(problem, solver)
-    return problem, solver
-
-
-@lru_cache(maxsize=1)
-def _read(file: str, format: str | None, maximise: bool) -> Problem:
-    """Read a file once, for the check and for the run."""
-    return read_problem(Path(file).expanduser(), format, maximise=maximise)
-
-
-def _minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
-    """The solver's answer; without variables there is one state, and no solver has to look for it."""
-    generator, given = rng.stream(seed, "solver"), problem.problem
-    if given.n == 0:
-        return BruteForce().minimise(_as_qubo(given), generator=generator)
-    try:
-        if isinstance(solver, DmmSolver):
-            return solver.minimise(given, generator=generator)
-        exact = problem.integers if isinstance(solver, BruteForce) and not problem.resolved else None
-        return solver.minimise(_as_qubo(given) if exact is None else exact, generator=generator)
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, MemoryError) or "memory" in str(error):
-            raise UserError(_too_large(problem, solver)) from error
-        raise
-
-
-def _as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
-    """What every solver takes; the machine takes clauses as they are."""
-    return problem if isinstance(problem, Qubo) else to_qubo(problem)
-
-
-def _check_memory(problem: Problem, solver: QuboSolver) -> None:
-    """Refuse what no memory holds: a recorded trajectory, or the states of all restarts."""
-    given = problem.problem
-    if isinstance(solver, DmmSolver) and solver.record is not None:
-        n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
-        require(
-            n_bytes // solver.record.every <= MOST_RECORDED,
-            "solver.record.every",
-            solver.record.every,
-            f"at least {1 + n_bytes // MOST_RECORDED}, for a trajectory of at most {MOST_RECORDED // 2**30} GiB",
-            "solver=dmm records nothing.",
-        )
-    if _memory(given, solver) > _installed():
-        raise UserError(_too_large(problem, solver))
-
-
-def _memory(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
-    """About the bytes that a solver works with: a few numbers a variable and a coupling, each restart."""
-    if isinstance(solver, (BruteForce, BranchAndBound)):
-        return 0
-    longer = () if isinstance(problem, Qubo) else problem.longer
-    pairs = 0 if isinstance(problem.graph, Bipartite) else math.prod(problem.graph.edge_shape)
-    numbers = problem.n + pairs + sum(block.variables.numel() for block in longer)
-    return _NUMBERS_EACH * 8 * int(getattr(solver, "n_restarts", 1)) * numbers
-
-
-_NUMBERS_EACH = 5
-"""Of eight bytes, for a variable or a coupling of a restart; measured."""
-
-
-def _installed() -> float:
-    """Bytes of memory of this computer; infinite where it does not tell."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):
-        return math.inf
-
-
-def _too_large(problem: Problem, solver: QuboSolver) -> str:
-    """Why the solver does not fit, and what to do."""
-    sizes = ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in problem.sizes.items())
-    restarts = getattr(solver, "n_restarts", None)
-    each = "" if restarts is None else f" with solver.n_restarts = {restarts}"
-    remedy = "a smaller problem" if restarts in (None, 1) else "fewer restarts, as solver.n_restarts=1"
-    needed, installed = (
-        f"{n_bytes / 2**30:.0f} GiB" for n_bytes in (_memory(problem.problem, solver), _installed())
-    )
-    return (
-        f"{problem.path}: {sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
-        f"more than there is ({installed}): try {remedy}."
-    )
 
 
 def _headline(problem: Problem) -> str:
@@ -190,7 +59,7 @@ def _remarks(problem: Problem, solver: QuboSolver) -> list[str]:
         remarks.append(
             f"{problem.n_unused} of the variables are not used: they cost nothing, and are reported as 0."
         )
-    if (needed := _memory(problem.problem, solver)) >= 2**30:
+    if (needed := memory_needed(problem.problem, solver)) >= 2**30:
         remarks.append(f"The solver needs about {needed / 2**30:.0f} GiB of memory.")
     return [f"Note: {remark}" for remark in remarks]
 

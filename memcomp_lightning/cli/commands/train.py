@@ -16,17 +16,19 @@ from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import figures, sweep, trajectory, worth
+from memcomp_lightning.cli import sweep
 from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
-from memcomp_lightning.cli.build import build, check_without_trainer
-from memcomp_lightning.cli.choice import for_trial, settle, tried_values
 from memcomp_lightning.cli.commands import report
-from memcomp_lightning.cli.errors import explain, in_words, refuse
-from memcomp_lightning.cli.hydra_versions import MAIN, instantiate
-from memcomp_lightning.cli.output import make_tolerant, say
-from memcomp_lightning.cli.overrides import CONFIG_MODULE, answering, check_command_line, search_path
+from memcomp_lightning.cli.output import make_tolerant, refuse, say
+from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
 from memcomp_lightning.cli.search import check_searchable
-from memcomp_lightning.cli.trainers import check_trainers, trainer_of
+from memcomp_lightning.configuration import comparisons, figures, trajectory
+from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
+from memcomp_lightning.configuration.composing import CONFIG_MODULE
+from memcomp_lightning.configuration.errors import explain, in_words
+from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
+from memcomp_lightning.configuration.plans import build, check_without_trainer
+from memcomp_lightning.configuration.trainers import check_trainers, trainer_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
@@ -66,7 +68,7 @@ def train(config: DictConfig) -> float | None:
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
     if config.worth is not None:
-        worth.check(config, overrides)
+        comparisons.check(config, overrides)
         return
     if config.figure is not None:
         if not {"name", "all"} & set(config.figure):
@@ -74,7 +76,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
                 "preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick."
             )
         for part, own in figures.parts(config, overrides).values():
-            check = trajectory.prepare if "curves" not in part.figure else figures.check
+            check = trajectory.check if "curves" not in part.figure else figures.check
             check(part, own)
         return
     for name, logger in config.logger.items():
@@ -131,14 +133,14 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     folder.check_source()
     try:
         if config.worth is not None:
-            worth.train_worth(config, overrides, folder.path)
+            comparisons.train(config, overrides, folder.path)
             trained = [folder.path]
         else:
             trained = []
             for name, (part, own) in figures.parts(config, overrides).items():
                 trained.append(folder.path / name)
                 trained[-1].mkdir(exist_ok=True)
-                train = trajectory.train_trajectory if "curves" not in part.figure else figures.train_curves
+                train = trajectory.train if "curves" not in part.figure else figures.train
                 train(part, own, trained[-1])
         report.main([*map(str, trained), "--output", str(folder.report)])
     except KeyboardInterrupt as stop:

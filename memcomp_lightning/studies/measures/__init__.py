@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from memcomp_lightning.studies.measures.ais import ais
-from memcomp_lightning.studies.measures.base import MakeMeasure, Measure, Scores
-from memcomp_lightning.studies.measures.kl import kl
-from memcomp_lightning.studies.measures.log_likelihood import log_likelihood
+from memcomp_lightning.studies.measures.ais import AIS
+from memcomp_lightning.studies.measures.base import Measure, Scores, Scoring
+from memcomp_lightning.studies.measures.kl import KL
+from memcomp_lightning.studies.measures.log_likelihood import LOG_LIKELIHOOD
 
-MEASURES: Mapping[str, MakeMeasure] = {"kl": kl, "log_likelihood": log_likelihood, "ais": ais}
+MEASURES: Mapping[str, Measure] = {"kl": KL, "log_likelihood": LOG_LIKELIHOOD, "ais": AIS}
 """By the names that ``worth.data_sets.NAME.measure`` takes."""
 
-__all__ = ["MEASURES", "MakeMeasure", "Measure", "Scores"]
+__all__ = ["MEASURES", "Measure", "Scores", "Scoring"]

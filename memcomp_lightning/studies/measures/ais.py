@@ -1,35 +1,37 @@
 """Log-likelihood by annealed importance sampling in both directions."""
 
-from typing import Any
-
 import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.likelihood import Ais, ReverseAis, base_of, base_on_first_class
 from memcomp_lightning.models import RBM, EnergyModel, as_two_layers
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.studies.measures.base import Measure, Scores, negative_log_likelihood
+from memcomp_lightning.studies.measures.base import Measure, Scores, Scoring, negative_log_likelihood
 
 FANTASY_SWEEPS = 200
 """Gibbs sweeps from training images to the samples from which reverse AIS starts."""
 
 
-def ais(data: Any, n_reported: int) -> Measure:
+def scoring(data: ImageDataModule, n_reported: int) -> Scoring:
     """AIS reports too small a partition function and reverse AIS too large a one: they bracket the score."""
     negative, v = negative_log_likelihood(data, n_reported), data.images.train_v
     base, annealing = base_of(v), Ais()
 
-    def measure(rbm: RBM) -> Scores:
-        up = annealing.estimate(rbm, generator=rng.stream(0, "ais"), base=base)
-        start, generator = v[: annealing.n_chains].expand(*rbm.replicas, -1, -1), rng.stream(0, "fantasies")
-        two_layers, base_of_two, samples = _of_two_layers(rbm, base, start, generator)
+    def measure(model: EnergyModel) -> Scores:
+        up = annealing.estimate(model, generator=rng.stream(0, "ais"), base=base)
+        start, generator = v[: annealing.n_chains].expand(*model.replicas, -1, -1), rng.stream(0, "fantasies")
+        two_layers, base_of_two, samples = _of_two_layers(model, base, start, generator)
         for _ in range(FANTASY_SWEEPS):
             samples = sweep(two_layers, samples, generator=generator)
         down = ReverseAis().estimate(two_layers, samples, generator=rng.stream(0, "reverse ais"), base=base_of_two)
-        return Scores(negative(rbm, up.log_z), negative(rbm, down.log_z))
+        return Scores(negative(model, up.log_z), negative(model, down.log_z))
 
     return measure
+
+
+AIS = Measure(scoring, "negative log-likelihood by AIS, nats", both_ways=True)
 
 
 def _of_two_layers(

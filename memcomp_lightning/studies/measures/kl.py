@@ -1,12 +1,14 @@
 """Divergence of the data set from the model, where the data set is all that there is to know."""
 
-from typing import Any
-
+from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.likelihood import kl_divergence
-from memcomp_lightning.studies.measures.base import Measure, Scores
+from memcomp_lightning.studies.measures.base import Measure, Scores, Scoring
 
 
-def kl(data: Any, n_reported: int) -> Measure:
-    """The data set itself, which every replica learns from."""
+def scoring(data: ImageDataModule, n_reported: int) -> Scoring:
+    """By the data set itself, which every replica learns from."""
     v = data.images.train_v
-    return lambda rbm: Scores(kl_divergence(rbm, v))
+    return lambda model: Scores(kl_divergence(model, v))
+
+
+KL = Measure(scoring, "KL divergence of the data, nats", is_exact=True, is_divergence=True)

@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
+from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.cli import kinds
-from memcomp_lightning.cli.hydra_versions import INITIALIZE
-from memcomp_lightning.cli.kinds import check_kinds
-from memcomp_lightning.cli.overrides import CONFIG_MODULE
+from memcomp_lightning.configuration import values
+from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.values import check_kinds
 from memcomp_lightning.errors import SettingError
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -23,7 +22,7 @@ NUMBER_OR_WORD = {"sampler.beta"}
 
 
 def composed(*overrides: str) -> DictConfig:
-    with initialize_config_module(CONFIG_MODULE, **INITIALIZE):
+    with composing():
         return compose("config", list(overrides))
 
 
@@ -60,9 +59,9 @@ def test_words_and_lists_in_place_of_every_number(option: str) -> None:
 def test_a_package_that_was_missing_once_is_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     config = composed("sampler=annealer")
     config.sampler.rate = "oops"
-    kinds._annotations.cache_clear()
+    values._annotations.cache_clear()
     with monkeypatch.context() as absent:
-        absent.setattr(kinds, "import_module", lambda name: importlib.import_module("not_installed"))
+        absent.setattr(values, "import_module", lambda name: importlib.import_module("not_installed"))
         check_kinds(config)
     with pytest.raises(SettingError):
         check_kinds(config)

@@ -1,23 +1,49 @@
-"""Settings against the kinds that the constructors ask for, before one of them is called."""
+"""Values of settings against what their constructors ask for, before one of them is called."""
 
+import dataclasses
 import inspect
+import math
 import types
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from os import PathLike
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import Tensor
 
-from memcomp_lightning.errors import require
+from memcomp_lightning.errors import require, require_choice
+
+T = TypeVar("T")
 
 _CHECKED = ("memcomp_lightning.", "torch.optim.", "lightning.pytorch.Trainer")
 """Where annotations say what is accepted; those of other packages are theirs."""
 
 _WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "text", types.NoneType: "null"}
+
+
+def check_values(settings: DictConfig) -> None:
+    """Refuse values that no constructor could take: of another kind, not finite; a seed that is no integer.
+
+    Raises:
+        SettingError: Naming the setting, its value and what is expected.
+    """
+    _check_finite(settings)
+    check_kinds(settings)
+    seed = settings.seed
+    require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
+
+
+def _check_finite(node: Any, name: str = "") -> None:
+    """Optimisers, samplers and solvers would take some NaN or infinity."""
+    if isinstance(node, DictConfig):
+        for key in node:
+            if not OmegaConf.is_interpolation(node, str(key)):
+                _check_finite(node[key], f"{name}.{key!s}".lstrip("."))
+    elif isinstance(node, float):
+        require(math.isfinite(node), name, node, "a finite number")
 
 
 def check_kinds(settings: DictConfig, name: str = "") -> None:
@@ -43,6 +69,41 @@ def check_kinds(settings: DictConfig, name: str = "") -> None:
             require(False, full_name, plain, _in_words(hints[key]))
         for part, own in _parts(value, full_name):
             check_kinds(part, own)
+
+
+def filled(schema: type[T], settings: DictConfig, name: str) -> T:
+    """Settings as the object of a dataclass, which says what there is and of which kind.
+
+    Args:
+        schema: The dataclass, perhaps of dataclasses; its constructor says what is in range.
+        settings: Its fields; those with a default may be left out.
+        name: Of the settings, for messages.
+
+    Raises:
+        SettingError: Naming the setting that is unknown, missing, or of another kind.
+    """
+    hints, known = typing.get_type_hints(schema), dataclasses.fields(schema)  # type: ignore[arg-type]
+    for key in settings:
+        require_choice(f"setting of {name}", str(key), tuple(hints))
+    for field in known:
+        given = field.name in settings or field.default is not dataclasses.MISSING
+        require(given, f"{name}.{field.name}", None, "a setting of each")
+    return schema(**{str(key): _as(hints[str(key)], settings[key], f"{name}.{key!s}") for key in settings})
+
+
+def _as(hint: Any, value: Any, name: str) -> Any:
+    """A value of a setting as what a field asks for: dataclasses, lists and dictionaries of them, or itself."""
+    for kind in _alternatives(hint):
+        origin, parts = typing.get_origin(kind), typing.get_args(kind)
+        if isinstance(value, DictConfig) and isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            return filled(kind, value, name)
+        if isinstance(value, DictConfig) and origin is dict:
+            return {str(key): _as(parts[1], value[key], f"{name}.{key!s}") for key in value}
+        if isinstance(value, ListConfig) and origin is list:
+            return [_as(parts[0], one, name) for one in value]
+    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    require(_fits(value, hint), name, plain, _in_words(hint))
+    return plain
 
 
 def _parts(value: Any, name: str) -> list[tuple[DictConfig, str]]:

@@ -1,17 +1,14 @@
-"""Errors as a user meets them: one message, no stack of frames from libraries."""
+"""Errors of configurations as a user meets them: one message, no stack of frames from libraries."""
 
 import difflib
-import sys
 from collections.abc import Collection
 from importlib.util import find_spec
-from typing import NoReturn
 
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import YAMLError
 
-from memcomp_lightning.cli.output import say
 from memcomp_lightning.errors import UserError
 
 CONFIGURATION_ERRORS = (
@@ -25,15 +22,6 @@ CONFIGURATION_ERRORS = (
     YAMLError,
 )
 """What building a run may raise on account of its settings; the package's own errors are ValueErrors."""
-
-USAGE_ERROR = 2
-"""Exit status when a setting is refused."""
-
-
-def refuse(command: str, error: Exception) -> NoReturn:
-    """End with the message alone."""
-    say(f"{command}: {error}", error=True)
-    sys.exit(USAGE_ERROR)
 
 
 def explain(error: BaseException) -> str:

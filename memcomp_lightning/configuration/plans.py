@@ -17,13 +17,12 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
-from memcomp_lightning.cli.errors import in_words
-from memcomp_lightning.cli.hydra_versions import instantiate
-from memcomp_lightning.cli.kinds import check_kinds
-from memcomp_lightning.cli.overrides import check_finite, check_seed
+from memcomp_lightning.configuration.errors import in_words
+from memcomp_lightning.configuration.hydra_versions import instantiate
+from memcomp_lightning.configuration.values import check_values
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
-from memcomp_lightning.models import DBN, BoltzmannMachine, start_at_means
+from memcomp_lightning.models import DBN, BoltzmannMachine, energy_models, start_at_means
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
 from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
@@ -65,10 +64,8 @@ def build(config: DictConfig) -> Plan:
     for group, known in _SETTINGS.items():
         for name in config if group == "" else config[group]:
             require_choice(f"setting {group}".rstrip(), name, known)
-    check_finite(config)
-    check_kinds(config)
+    check_values(config)
     seed = config.seed
-    check_seed(seed)
     precision_of(config.trainer.precision)
     require_count("checkpoint_every", config.checkpoint_every)
     for name, values in config.tried.items():
@@ -79,7 +76,8 @@ def build(config: DictConfig) -> Plan:
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = stage_for = None
-    if isinstance(network, DBN | BoltzmannMachine) and config.pretrain.iterations > 0:
+    models = energy_models(network)
+    if models and config.pretrain.iterations > 0:
         callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
         centring = _part(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
@@ -87,7 +85,7 @@ def build(config: DictConfig) -> Plan:
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
-            start_at_means(network[0] if isinstance(network, DBN) else network, data.train[0])
+            start_at_means(models[0], data.train[0])
         schedules = _schedules(config, "pretrain")
         stage_for = instantiate(config.pretrain.stage)
         try:
@@ -106,7 +104,7 @@ def build(config: DictConfig) -> Plan:
         pretraining = Stage(module, data, callbacks)
     if config.finetune.iterations > 0:
         require(
-            not isinstance(network, BoltzmannMachine),
+            isinstance(network, DBN) or not models,
             "finetune.iterations",
             config.finetune.iterations,
             "0 for a Boltzmann machine, which is no feed-forward network",

@@ -1,18 +1,16 @@
 """A setting whose value held-out training images choose: ``choose={setting: NAME, values: [...]}``."""
 
 import copy
-import json
 import logging
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.build import plan_of
+from memcomp_lightning.configuration.plans import plan_of
 from memcomp_lightning.errors import UserError, require, require_choice
-from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.studies.accuracy import Member, Unit, run_unit
+from memcomp_lightning.studies import AccuracyTrial, Records, SideBySide, best
 
 HELD_OUT = 0.1
 """Share of the training images that judge, unless ``data.validation_fraction`` sets one."""
@@ -61,30 +59,55 @@ def for_trial(config: DictConfig, value: float) -> DictConfig:
     return chosen
 
 
+def trial_of(
+    config: DictConfig,
+    method: str,
+    *,
+    value: float | None = None,
+    choosing: bool = False,
+    iterations: int | None = None,
+    seed: int | None = None,
+) -> AccuracyTrial:
+    """A training with these settings.
+
+    Args:
+        config: Of one run; with a value to choose, before the choice.
+        method: Name of the trial.
+        value: Of the setting that is chosen; None where nothing is.
+        choosing: Whether the value is only tried.
+        iterations: Of pretraining; None is what the settings say.
+        seed: Likewise.
+    """
+    own = config
+    if value is not None:
+        own = for_trial(config, value) if choosing else with_choice(config, value)
+    settings: Any = OmegaConf.to_container(own, resolve=False)
+    iterations = own.pretrain.iterations if iterations is None else iterations
+    seed = own.seed if seed is None else seed
+    return AccuracyTrial(method, settings, plan_of, iterations, seed, value, choosing)
+
+
 def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str, Any] | None]:
-    """Try each value, and return the settings with the best one, and what was found; written to ``choice.json``.
+    """Try each value; return the settings with the best one, and what was found. Records go to ``choice.jsonl``.
 
     Each value trains without a trainer, on the images that are not held out, and is judged after the last pass.
     """
     values = tried_values(config)
     if not values:
         return config, None
-    path = folder.path / "choice.json"
-    if path.exists():
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return with_choice(config, found["value"]), found
-    accuracies = []
+    setting, records = config.choose.setting, Records(folder.path, "choice.jsonl")
     for number, value in enumerate(values, start=1):
-        trial = for_trial(config, value)
-        plain: Any = OmegaConf.to_container(trial, resolve=False)
-        member = Member("choose", plain, plan_of, trial.pretrain.iterations, trial.seed, value, choosing=True)
-        (record,) = run_unit(Unit((member,), (trial.finetune.iterations,), 0), lambda what, n_updates: None)
-        accuracies.append(float(record.score("validation_accuracy").mean()))
-        log.info(
-            "Trial %d of %d: %s = %s, accuracy %.4f on held-out training images",
-            *(number, len(values), config.choose.setting, value, accuracies[-1]),
-        )
-    best = values[accuracies.index(max(accuracies))]
-    found = {"setting": config.choose.setting, "value": best, "values": values, "accuracies": accuracies}
-    write_text(path, json.dumps(found, indent=1) + "\n")
-    return with_choice(config, best), found
+        trial = trial_of(config, "choose", value=value, choosing=True)
+        if trial.key not in records.keys:
+            passes = (trial.settings["finetune"]["iterations"],)
+            records.append(SideBySide((trial,), passes, 0).run(lambda what, n_updates: None))
+            log.info(
+                "Trial %d of %d: %s = %s, accuracy %.4f on held-out training images",
+                *(number, len(values), setting, value, records.all[-1].held_out),
+            )
+    chosen = best(records.all)
+    assert chosen is not None
+    assert chosen.value is not None
+    accuracies = [record.held_out for record in records.all]
+    found = {"setting": setting, "value": chosen.value, "values": values, "accuracies": accuracies}
+    return with_choice(config, chosen.value), found

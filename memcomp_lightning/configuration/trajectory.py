@@ -6,9 +6,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli.build import build
-from memcomp_lightning.cli.figures import composed_for
-from memcomp_lightning.cli.hydra_versions import instantiate
+from memcomp_lightning.configuration.composing import composed_for
+from memcomp_lightning.configuration.hydra_versions import instantiate
+from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.models import DBN
 from memcomp_lightning.solvers.dmm import DmmSolver, Recording
@@ -16,13 +16,13 @@ from memcomp_lightning.studies.plan import Plan
 from memcomp_lightning.studies.trajectory import draw_trajectory
 
 
-def prepare(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolver]:
+def check(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolver]:
     """Build the network and the machine.
 
     Raises:
         SettingError: The solver is not the DMM, or nothing is pretrained.
     """
-    composed = composed_for(tuple(overrides))
+    composed = composed_for(overrides)
     plan, solver = build(composed), instantiate(composed.solver)
     if not isinstance(plan.network, DBN) or plan.pretraining is None:
         raise SettingError(f"{config.figure.name} needs pretraining: model=dbn and pretrain.iterations >= 1.")
@@ -30,6 +30,6 @@ def prepare(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolv
     return plan, replace(solver, record=Recording(every=1))
 
 
-def train_trajectory(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
+def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     """Pretrain a DBN, let the machine solve its first RBM once more, and draw its path."""
-    draw_trajectory(*prepare(config, overrides), seed=config.seed, folder=folder)
+    draw_trajectory(*check(config, overrides), seed=config.seed, folder=folder)

@@ -14,8 +14,8 @@ from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.callbacks import BestWeights
-from memcomp_lightning.cli.errors import explain
-from memcomp_lightning.cli.hydra_versions import instantiate
+from memcomp_lightning.configuration.errors import explain
+from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.modules.trainers import NOT_WITH_STAGES, check_trainer, tries
 from memcomp_lightning.modules.weights import AtomicCheckpointIO

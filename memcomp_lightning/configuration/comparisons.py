@@ -1,0 +1,135 @@
+"""``experiment=sampler_worth``: energy models trained by many samplers, measured by likelihood on the way."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from memcomp_lightning.configuration.composing import check_not_given, composed_for
+from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
+from memcomp_lightning.configuration.values import filled
+from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.files import write_text
+from memcomp_lightning.models import joint_model, stacked
+from memcomp_lightning.studies import LikelihoodTrial, Records, runner
+from memcomp_lightning.studies.likelihood import pretraining_of
+from memcomp_lightning.studies.measures import MEASURES
+from memcomp_lightning.studies.worth import Comparison, Method
+
+_SET_BY_COMPARISON = {"pretrain.iterations": "It has passes of its data sets.", "sampler": "It has methods."}
+
+
+def check(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Build one replica of every method on every data set, and train nothing.
+
+    Raises:
+        UserError, SettingError, InstantiationException: As ``build``.
+    """
+    if config.figure is not None:
+        raise UserError(
+            "preset=quick is one of figures: make the comparison smaller with worth.only=[DATA_SET], "
+            "worth.replicas=N or worth.methods.NAME.rates=[...]."
+        )
+    check_not_given(overrides, _SET_BY_COMPARISON, "a comparison")
+    comparison = _comparison(config)
+    require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
+    seen: set[tuple[str, str]] = set()
+    for trial in _trials(comparison, overrides, Path()):
+        own = OmegaConf.create(trial.settings)
+        plan = build(own)
+        check_without_trainer(plan, own)
+        data = pretraining_of(plan)[0].data
+        require(data.replicas == (), "data.partitions", data.replicas, "1: replicas are seeds here")
+        if (trial.data_set, trial.method) not in seen:
+            seen.add((trial.data_set, trial.method))
+            measure = MEASURES[trial.measure]
+            score = measure.make(data, 1)
+            if measure.is_exact:
+                score(joint_model(stacked([plan.network], ())))
+
+
+def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
+    """Train what is missing; each record is written when it exists."""
+    comparison, records = _comparison(config), Records(folder)
+    write_text(folder / "worth.json", json.dumps(asdict(comparison), indent=1) + "\n")
+    (folder / "weights").mkdir(exist_ok=True)
+    missing = [trial for trial in _trials(comparison, overrides, folder) if trial.key not in records.keys]
+    with runner(comparison.name, workers=comparison.workers) as run:
+        run(missing, records)
+
+
+def _comparison(config: DictConfig) -> Comparison:
+    return filled(Comparison, config.worth, "worth")
+
+
+def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> Iterator[LikelihoodTrial]:
+    for data_name in comparison.only or comparison.data_sets:
+        data_set = comparison.data_sets[data_name]
+        for method_name in data_set.methods or comparison.methods:
+            method = comparison.methods[method_name]
+            passes = max(1, round(data_set.passes * method.longer))
+            own_overrides = (*method.overrides, *data_set.overrides)
+            schedule = _schedule(composed_for(overrides, (*own_overrides, *_run_settings(passes))), passes, method)
+            composed = composed_for(overrides, (*own_overrides, *_run_settings(schedule.iterations)))
+            for rate in data_set.rates or method.rates or comparison.rates:
+                own: Any = OmegaConf.to_container(composed, resolve=False)
+                own["pretrain"] = {**own["pretrain"], "optimizer": {**own["pretrain"]["optimizer"], "lr": rate}}
+                yield LikelihoodTrial(
+                    data_set=data_name,
+                    method=method_name,
+                    value=rate,
+                    folder=str(folder),
+                    settings=own,
+                    build=plan_of,
+                    n_reported=comparison.n_reported(data_name),
+                    n_choosing=data_set.choosing or comparison.choosing,
+                    points=_points(schedule.passes, data_set.points or comparison.points),
+                    measure=data_set.measure,
+                    gradient_draws=comparison.gradient_draws,
+                    greedy_passes=schedule.greedy_passes,
+                )
+
+
+class _Schedule(NamedTuple):
+    """Passes of one method.
+
+    Attributes:
+        iterations: Of a layer, or of all layers together.
+        greedy_passes: Of each layer, before joint training.
+        passes: All together.
+    """
+
+    iterations: int
+    greedy_passes: int
+    passes: int
+
+
+def _schedule(composed: DictConfig, passes: int, method: Method) -> _Schedule:
+    """Share passes out to layers, so that methods of many layers and of one have about as many updates."""
+    n_phases, layers = len(pretraining_of(build(composed))[1].phases), len(composed.model.get("hidden_sizes", [0]))
+    if n_phases > 1 or not method.greedy_start:
+        each = max(1, passes // n_phases)
+        return _Schedule(each, 0, each * n_phases)
+    greedy = round(passes * method.greedy_start / layers)
+    joint = max(1, passes - greedy * layers)
+    return _Schedule(joint, greedy, greedy * layers + joint)
+
+
+def _run_settings(passes: int) -> tuple[str, ...]:
+    """No fine-tuning, plain gradient descent at a rate that falls to a hundredth."""
+    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:" + str(passes) + "}"
+    return (
+        f"pretrain.iterations={passes}",
+        "finetune.iterations=0",
+        "pretrain.schedules.momentum=null",
+        f"pretrain.schedules.decay={decay}",
+    )
+
+
+def _points(passes: int, n: int) -> tuple[int, ...]:
+    """Passes that are about evenly spaced in the logarithm, the last one included."""
+    spaced = [round(passes ** (k / (n - 1))) for k in range(n)] if n > 1 else [passes]
+    return tuple(dict.fromkeys(spaced))

@@ -1,0 +1,81 @@
+"""Configurations composed by Hydra: of this package's groups, of the user's, and one curve's or method's own."""
+
+import functools
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
+
+from hydra import compose, initialize_config_module
+from hydra.errors import ConfigCompositionException
+from omegaconf import DictConfig, OmegaConf
+
+from memcomp_lightning.configuration.hydra_versions import INITIALIZE
+from memcomp_lightning.errors import require
+
+CONFIG_MODULE = "memcomp_lightning.conf"
+"""Where our groups are."""
+
+SEARCH_PATH = "hydra.searchpath="
+"""Begins the override that says where else groups are looked for."""
+
+_OF_MANY_RUNS = ("hydra.", "figure.", "figure/", "worth.", "worth/")
+"""Overrides that say nothing of a single run."""
+
+
+def composing() -> AbstractContextManager[None]:
+    """The context in which :func:`composed_for` and Hydra's ``compose`` find our groups, outside of a command."""
+    context: AbstractContextManager[None] = initialize_config_module(CONFIG_MODULE, **INITIALIZE)
+    return context
+
+
+def search_paths(overrides: Iterable[str]) -> list[str]:
+    """The overrides that say where to look for groups."""
+    return [override for override in overrides if override.startswith(SEARCH_PATH)]
+
+
+def composed_for(common: Iterable[str], own: Iterable[str] = ()) -> DictConfig:
+    """The configuration of one curve or method, without its study; composed once, and not to be changed.
+
+    Args:
+        common: Overrides of all. Those that this one has no setting for are left out: ``solver.max_steps`` where
+            its solver is descent.
+        own: Its own overrides, which must apply.
+    """
+    common = tuple(common)
+    of_one = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
+    return _composed(tuple(search_paths(common)), of_one, tuple(own))
+
+
+@functools.cache
+def _composed(search_path: tuple[str, ...], common: tuple[str, ...], own: tuple[str, ...]) -> DictConfig:
+    try:
+        composed = compose("config", [*search_path, *common, *own])
+    except ConfigCompositionException:
+        groups = (o for o in (*common, *own) if "." not in o.partition("=")[0])
+        bare = compose("config", [*search_path, *groups])
+        applying = (o for o in common if _applies(o.partition("=")[0], bare))
+        composed = compose("config", [*search_path, *applying, *own])
+    composed.figure = composed.worth = None
+    return composed
+
+
+def _applies(name: str, config: DictConfig) -> bool:
+    if "." not in name or name.startswith("+"):
+        return True
+    parent, _, key = name.rpartition(".")
+    node = OmegaConf.select(config, parent)
+    return isinstance(node, DictConfig) and key in node
+
+
+def check_not_given(overrides: Iterable[str], instead: Mapping[str, str], of: str) -> None:
+    """Refuse overrides of what a study sets itself.
+
+    Args:
+        overrides: As typed.
+        instead: What to do in their place, by setting; OVERRIDE in it stands for what was typed.
+        of: The kind of study.
+    """
+    for override in overrides:
+        typed = override.lstrip("+")
+        name, _, value = typed.partition("=")
+        remedy = instead.get(name, "").replace("OVERRIDE", typed)
+        require(name not in instead, name, value, f"nothing in {of}", remedy)

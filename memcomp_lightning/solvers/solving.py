@@ -1,0 +1,89 @@
+"""A problem of a file handed to a solver: in the form that it takes, within the memory that there is."""
+
+import math
+import os
+
+from memcomp_lightning import rng
+from memcomp_lightning.errors import UserError, require
+from memcomp_lightning.problems import Bipartite, Problem, Qubo, WeightedMaxSat, to_qubo
+from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
+from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
+from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.dmm import DmmSolver, default_steps
+
+MOST_RECORDED = 4 * 2**30
+"""Bytes of a trajectory that a common computer's memory holds."""
+
+
+def minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
+    """The solver's answer; without variables there is one state, and no solver has to look for it."""
+    generator, given = rng.stream(seed, "solver"), problem.problem
+    if given.n == 0:
+        return BruteForce().minimise(as_qubo(given), generator=generator)
+    try:
+        if isinstance(solver, DmmSolver):
+            return solver.minimise(given, generator=generator)
+        exact = problem.integers if isinstance(solver, BruteForce) and not problem.resolved else None
+        return solver.minimise(as_qubo(given) if exact is None else exact, generator=generator)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError) or "memory" in str(error):
+            raise UserError(_too_large(problem, solver)) from error
+        raise
+
+
+def as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
+    """What every solver takes; the machine takes clauses as they are."""
+    return problem if isinstance(problem, Qubo) else to_qubo(problem)
+
+
+def check_memory(problem: Problem, solver: QuboSolver) -> None:
+    """Refuse what no memory holds: a recorded trajectory, or the states of all restarts."""
+    given = problem.problem
+    if isinstance(solver, DmmSolver) and solver.record is not None:
+        n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
+        require(
+            n_bytes // solver.record.every <= MOST_RECORDED,
+            "solver.record.every",
+            solver.record.every,
+            f"at least {1 + n_bytes // MOST_RECORDED}, for a trajectory of at most {MOST_RECORDED // 2**30} GiB",
+            "solver=dmm records nothing.",
+        )
+    if memory_needed(given, solver) > _installed():
+        raise UserError(_too_large(problem, solver))
+
+
+def memory_needed(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
+    """About the bytes that a solver works with: a few numbers a variable and a coupling, each restart."""
+    if isinstance(solver, (BruteForce, BranchAndBound)):
+        return 0
+    longer = () if isinstance(problem, Qubo) else problem.longer
+    pairs = 0 if isinstance(problem.graph, Bipartite) else math.prod(problem.graph.edge_shape)
+    numbers = problem.n + pairs + sum(block.variables.numel() for block in longer)
+    return _NUMBERS_EACH * 8 * int(getattr(solver, "n_restarts", 1)) * numbers
+
+
+_NUMBERS_EACH = 5
+"""Of eight bytes, for a variable or a coupling of a restart; measured."""
+
+
+def _installed() -> float:
+    """Bytes of memory of this computer; infinite where it does not tell."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf
+
+
+def _too_large(problem: Problem, solver: QuboSolver) -> str:
+    """Why the solver does not fit, and what to do."""
+    sizes = ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in problem.sizes.items())
+    restarts = getattr(solver, "n_restarts", None)
+    each = "" if restarts is None else f" with solver.n_restarts = {restarts}"
+    remedy = "a smaller problem" if restarts in (None, 1) else "fewer restarts, as solver.n_restarts=1"
+    needed, installed = (
+        f"{n_bytes / 2**30:.0f} GiB" for n_bytes in (memory_needed(problem.problem, solver), _installed())
+    )
+    return (
+        f"{problem.path}: {sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
+        f"more than there is ({installed}): try {remedy}."
+    )
