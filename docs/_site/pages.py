@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = "memcomp_lightning"
 
 # What the commands are made of, which nobody imports.
-INTERNAL = ("cli", "conf", "configuration")
+INTERNAL = ("cli", "conf")
 
 # Titles of results, in the order of the README; other experiments follow under their own headings.
 TITLES = {

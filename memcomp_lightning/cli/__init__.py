@@ -1,1 +1,1 @@
-"""The command line: thin, and the only place that knows Hydra."""
+"""The command line: arguments in, words out."""

@@ -1,1 +1,15 @@
-"""From settings by name to the objects of a run or of a study: what any front end needs, and Hydra composes."""
+"""From settings by name to the objects of a run or of a study: what any front end needs, and Hydra composes.
+
+>>> from hydra import compose
+>>> with composing():
+...     plan = build(compose("config", ["sampler=cd", "model.hidden_sizes=[16]"]))
+>>> [stage.module.stage for stage in plan.stages]
+['pretrain', 'finetune']
+"""
+
+from memcomp_lightning.configuration.composing import composed_for, composing
+from memcomp_lightning.configuration.plans import build
+from memcomp_lightning.configuration.trainers import trainer_of
+from memcomp_lightning.configuration.values import check_values, filled
+
+__all__ = ["build", "check_values", "composed_for", "composing", "filled", "trainer_of"]
