@@ -1,3 +1,3 @@
-"""Restricted Boltzmann machines and deep belief networks whose negative phase is a swappable part."""
+"""Train restricted Boltzmann machines and deep belief networks, with a choice of samplers for the gradient."""
 
 __version__ = "0.2.0"

@@ -1,8 +1,8 @@
-"""What the caller's thread has switched on elsewhere, kept out of this package's numbers.
+"""Keep what a caller has set in torch (no_grad, inference mode, autocast) from changing this package's numbers.
 
-Gradients that are off, inference mode and autocast belong to the code around a call. Models, their updates and
-their likelihoods are the same whatever they are: these helpers say so where it would not be true by itself. Dtypes
-and devices of new tensors are named where they are made, so that torch's defaults do not matter.
+Models, their updates and their likelihoods must not depend on such settings; where torch alone would let them,
+the code uses these helpers. Dtypes and devices of new tensors are named where they are made, so that torch's
+defaults do not matter.
 """
 
 from collections.abc import Callable, Iterator

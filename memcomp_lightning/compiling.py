@@ -1,4 +1,4 @@
-"""A word about the first use of compiled kernels, which takes a while."""
+"""Tell the user why the first use of a compiled kernel takes a while."""
 
 import logging
 from collections.abc import Callable, Iterator

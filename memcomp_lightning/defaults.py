@@ -1,6 +1,6 @@
-"""Settings that a first user gets, whether in Python, from scikit-learn or on the command line.
+"""Default settings, the same in Python, in scikit-learn and on the command line.
 
-Chosen on held-out data: experiments/defaults. A test holds the files of ``conf`` against them.
+They were chosen on held-out data: experiments/defaults. A test checks that the files of ``conf`` agree with them.
 """
 
 BATCH_SIZE = 20
@@ -25,7 +25,7 @@ FINETUNING_PASSES = 50
 """Passes over the training set of back-propagation."""
 
 FINETUNING_LEARNING_RATE = 0.2
-"""Of back-propagation."""
+"""Learning rate of back-propagation."""
 
 FINETUNING_MOMENTUM = 0.9
-"""Of back-propagation."""
+"""Momentum of back-propagation."""

@@ -54,4 +54,6 @@ def require_parts(name: str, value: object, kind: str, parts: Collection[str]) -
     given = value if isinstance(value, str) else getattr(value, "__name__", type(value).__name__)
     missing = [part for part in parts if not hasattr(value, part)]
     complete = not missing and not isinstance(value, type)
-    require(complete, name, given, f"a {kind}, which has {', '.join(missing) or 'settings: an object, no class'}")
+    wanted = f", which has {', '.join(missing)}" if missing else ": an object, no class"
+    remedy = f"Make one: {given}(...)." if isinstance(value, type) and not missing else ""
+    require(complete, name, given, f"a {kind}{wanted}", remedy)

@@ -1,4 +1,4 @@
-"""The one loss for every sampler of the negative phase."""
+"""The loss that trains an energy model; it is the same for every sampler of the negative phase."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, cast
@@ -12,7 +12,12 @@ from memcomp_lightning.types import Configurations
 
 
 class Offsets(NamedTuple):
-    """Centres of the units, ``(*replicas, n_visible)`` and ``(*replicas, n_hidden)``."""
+    """What the centred gradient subtracts from the units: their running means.
+
+    Attributes:
+        visible: ``(*replicas, n_visible)``.
+        hidden: ``(*replicas, n_hidden)``.
+    """
 
     visible: Tensor
     hidden: Tensor
@@ -20,10 +25,11 @@ class Offsets(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Centring:
-    """Settings of the centred gradient: the means of the positive phase, followed update by update.
+    """Settings of the centred gradient, which subtracts the means of the units and is better conditioned.
 
-    Of an update in chunks the first chunk counts. Montavon & Mueller 2012; Melchior, Fischer & Wiskott 2016 ("dd",
-    with the sliding average that they recommend).
+    The means are those of the positive phase, as a sliding average over the updates. If the images of an update
+    come in chunks, the average takes the first chunk alone. Montavon & Mueller 2012; Melchior, Fischer & Wiskott
+    2016 ("dd", with the sliding average that they recommend).
 
     Attributes:
         rate: Weight of the newest update in the offsets, in (0, 1].
@@ -67,7 +73,7 @@ def contrast(
     negative: Configurations,
     offsets: Offsets | None = None,
 ) -> Float[Tensor, "*replicas"]:
-    r"""Return ``mean E(positive) - mean E(negative)`` for each replica, means by the weights.
+    r"""Return the loss of each replica, ``mean E(positive) - mean E(negative)``, with weighted means.
 
     With the hidden means given the data as the positive phase and the exact expectation as the negative
     one, its gradient is the gradient of the mean negative log-likelihood (eqs. 4 to 6 of Manukian et al.
@@ -75,8 +81,8 @@ def contrast(
     the backward pass: they stay independent.
 
     With ``offsets`` the value is the same and the gradient is that of a model whose units are centred,
-    :math:`E = -(h - \lambda)^T W (v - \mu) - b'^T v - c'^T h`: it does not change when units are flipped, zero for
-    one, and is better conditioned. In the parameters of the plain energy, for offsets :math:`\mu, \lambda` that
+    :math:`E = -(h - \lambda)^T W (v - \mu) - b'^T v - c'^T h`: it does not change when units swap 0 and 1, and is
+    better conditioned. In the parameters of the plain energy, for offsets :math:`\mu, \lambda` that
     stand still, its step is that of :math:`\nabla W`, :math:`\nabla b' - \nabla W^T \lambda` and
     :math:`\nabla c' - \nabla W \mu`, where :math:`\nabla W` is made of :math:`(h - \lambda)(v - \mu)^T`.
 

@@ -1,4 +1,4 @@
-"""Names of a package that need another one, which may not be installed."""
+"""Import a module only when it is asked for, because it needs a package that may not be installed."""
 
 from collections.abc import Callable, Mapping
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Callbacks for any LightningModule that offers the protocol of :mod:`memcomp_lightning.callbacks.base`."""
+"""Callbacks that log, draw or guard training; :mod:`memcomp_lightning.callbacks.base` says what they need."""
 
 from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.classification import ClassificationMetrics

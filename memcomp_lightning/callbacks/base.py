@@ -1,20 +1,26 @@
 """What the callbacks ask of a LightningModule, and how they log.
 
-A module that trains an energy model offers both of these:
+A module that trains an energy model offers all of these:
 
 * ``training_step`` returns a dictionary with ``positive`` and ``negative`` (:class:`Configurations`),
-  ``contrast`` ``(*replicas,)`` and ``info`` (diagnostics of the sampler), and with ``v``, the visible states of
-  the images, if ``positive.v`` is something else; ``validation_step`` returns one with ``v`` of held-out images.
+  ``contrast`` ``(*replicas,)``, which is mean E(positive) - mean E(negative), and ``info`` (diagnostics of the
+  sampler); also with ``v``, the visible states of the images, if ``positive.v`` is something else.
+* ``validation_step`` returns a dictionary with ``v``, the visible states of held-out images.
 * Attributes: ``model``, the model in training.
 
 A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.training.Score`) in the
 dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
 
-Optional attributes: ``log_prefix`` (prefix of tags, default the class name), ``iteration`` (default the
-epoch), ``iterations`` (passes of a stage or layer, default the trainer's ``max_epochs``), ``progress`` (text of
-the progress bar), ``images_of(v)`` (inputs that visible states stand for), ``models`` and ``layer`` (all that are
-trained, from the lowest up, and which of them ``model`` is, from 0), ``sampler`` (tells whether chains persist,
-default yes), ``active_optimizer``.
+Optional attributes:
+
+* ``log_prefix``: begins each tag; default the class name.
+* ``iteration``, ``iterations``: passes done, and planned, in this stage or layer; default the epoch and the
+  trainer's ``max_epochs``.
+* ``progress``: text of the progress bar.
+* ``images_of(v)``: inputs that visible states stand for, for pictures.
+* ``models``, ``layer``: all models that are trained, from the lowest up, and the index of ``model`` among them.
+* ``sampler``: shows whether its chains persist; without one they are taken to.
+* ``active_optimizer``: the optimiser that steps now; default the trainer's first.
 """
 
 from abc import ABC, abstractmethod
@@ -117,10 +123,10 @@ def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_un
 
 
 class LastImages:
-    """Visible states of the last batches of a pass.
+    """Collects the newest images of a pass, so that a callback can judge them at its end.
 
     Args:
-        n: Batches are kept until they hold so many images a replica, >= 1.
+        n: Images a replica to keep, >= 1; whole batches are kept, so there may be more.
     """
 
     def __init__(self, n: int) -> None:

@@ -14,8 +14,9 @@ class BestWeights(pl.Callback):
     """Keeps the weights of the pass with the highest accuracy on held-out images, and puts them back at the end.
 
     Works with any module whose ``validation_step`` returns a dictionary with ``score``
-    (:class:`memcomp_lightning.training.Score`). Replicas keep a pass each: their tensors begin with the axes of
-    the accuracy. Of passes that are equal the first one stays. The state is in checkpoints.
+    (:class:`memcomp_lightning.training.Score`). Each replica keeps its own best pass, so parameters must begin
+    with the replica axes, which are those of the accuracy. Of equal passes the first one stays. Checkpoints hold
+    the weights kept so far.
     """
 
     def __init__(self) -> None:
@@ -55,7 +56,7 @@ class BestWeights(pl.Callback):
             pl_module.load_state_dict(self._best.weights)
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """The same where nothing was left to train, after an interruption at the very end."""
+        """Put them back, too, if a resumed run had nothing left to train."""
         self.on_train_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:

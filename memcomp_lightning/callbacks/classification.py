@@ -8,7 +8,9 @@ from memcomp_lightning.callbacks.base import log_scalars, required
 
 
 class ClassificationMetrics(pl.Callback):
-    """Logs ``loss`` and ``accuracy`` of the pass, ``heldout_`` and ``test_`` likewise: means over replicas.
+    """Logs loss and accuracy of a classifier, on training, held-out and test images: means over replicas.
+
+    The names are ``loss``, ``accuracy``, ``heldout_loss``, ``heldout_accuracy``, ``test_loss``, ``test_accuracy``.
 
     Works with any module whose ``training_step``, ``validation_step`` and ``test_step`` return a dictionary
     with ``score`` (:class:`memcomp_lightning.training.Score`). The values of each replica stay in ``latest``.

@@ -10,16 +10,16 @@ from memcomp_lightning.callbacks.base import LastImages, images_of_step, log_sca
 
 
 class FreeEnergyGap(pl.Callback):
-    """Logs ``free_energy_train``, ``free_energy_heldout`` and their difference ``free_energy_gap``.
+    """Shows overfitting: logs ``free_energy_train``, ``free_energy_heldout`` and ``free_energy_gap``.
 
     The overfitting monitor of Hinton 2010, section 6. The unknown log Z cancels in ``mean F(held-out) - mean
     F(train) = mean log p(train) - mean log p(held-out)``: the gap is about zero at first, and one that grows is
     overfitting, by so many nats an image. Free energies alone say nothing, and gaps of different models (layers,
-    seeds) do not compare in size. Training images are those of the pass's last batches, about ``n_images`` of
-    them, judged by the same model as the first ``n_images`` held-out ones, the same in each pass.
+    seeds) cannot be compared in size. The same model judges the first ``n_images`` held-out images, the same in
+    each pass, and about as many training images, from the last batches of the pass.
 
     Args:
-        n_images: Images of either kind a replica to judge, >= 1; of training images whole batches, so that there
+        n_images: Images of each kind to judge, a replica, >= 1; training images come in whole batches, so there
             may be a few more.
     """
 

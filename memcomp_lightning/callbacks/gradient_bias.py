@@ -25,16 +25,17 @@ MAX_UNITS = 16
 
 
 class GradientBias(EveryIterations):
-    """Logs ``gradient_bias/cosine`` and ``gradient_bias/relative_error`` of the pass's last batch.
+    """Shows how far the sampler's gradient is from the exact one, for the last batch of a pass.
 
-    With g the gradient of the contrast of the batch's ``positive`` and ``negative`` configurations, and g* that of
-    ``positive`` and the exact expectation, they are ``g.g* / |g||g*|`` and ``|g - g*| / |g*|``, weights and biases
-    together, means over replicas. The noise of one batch's chains is in them, too: it falls with the number of
-    chains, the bias of the sampler does not. Both are plain gradients, also where training follows another one
-    (centred, with weight decay), at the parameters that the sampler met, before the step; they are taken on a
-    copy, so that ``grad`` of the model is not touched.
+    Logs ``gradient_bias/cosine``, which is ``g.g* / |g||g*|``, and ``gradient_bias/relative_error``, which is
+    ``|g - g*| / |g*|``: g follows from the sampler's negative phase, g* from the exact expectation. Weights and
+    biases count together; values are means over replicas. The noise of one batch's chains is in them, too: it
+    falls with the number of chains, the bias of the sampler does not. Both are plain gradients, also where
+    training follows another one (centred, with weight decay), at the parameters that the sampler met, before the
+    step. They are taken on a copy, so that ``grad`` of the model is not touched.
 
-    The smaller layer is enumerated, with 2^units times units of the larger layer numbers for each replica.
+    All states of the smaller layer are held at once: for each replica 2^(its units) rows, each as long as the
+    larger layer.
 
     Args:
         every: Passes between two values, >= 1.

@@ -47,18 +47,19 @@ class LikelihoodValue(TypedDict):
 
 
 class LogLikelihood(EveryIterations):
-    """Logs ``log_likelihood_train``, ``log_likelihood_heldout`` and ``log_z``: nats an image, means over replicas.
+    """Measures how well a model fits training and held-out images: log-likelihood in nats, mean over replicas.
 
+    The names are ``log_likelihood_train`` and ``log_likelihood_heldout``, per image, and ``log_z``, of the model.
     Training images are those of the pass's last batches, about ``n_images`` of them; held-out images are those of
     a validation at the end of the pass, if there is one. Images that are not 0 or 1 have no likelihood under a
     Bernoulli model: each intensity is taken as the probability of a 1 and drawn, with a random stream of the
     callback's own, the same draws each time. In upper layers of a stack the "images" are mean activations, drawn
-    likewise, and the likelihood is that of the layer. Of a Boltzmann machine with more than 16 hidden units it is
-    the mean-field bound.
+    likewise, and the likelihood is that of the layer. For a Boltzmann machine with more than 16 hidden units the
+    mean-field bound takes the place of the likelihood.
 
-    By annealed importance sampling (Salakhutdinov & Murray 2008), from independent units with the means of the
-    training images, log Z is an estimate that tends to be too small, the likelihood too large;
-    ``log_z_standard_error`` and ``log_z_effective_sample_size``, of ``n_chains``, say how far to trust it.
+    Annealed importance sampling (AIS; Salakhutdinov & Murray 2008) starts at independent units with the means of
+    the training images. Its estimate of log Z tends to be too small, and the likelihood too large;
+    ``log_z_standard_error`` and ``log_z_effective_sample_size`` (out of ``n_chains``) say how far to trust it.
 
     Attributes:
         history: Every value so far, the oldest first; checkpoints keep it.

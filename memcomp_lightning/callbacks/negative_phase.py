@@ -12,8 +12,8 @@ class NegativePhaseEnergies(EveryIterations):
     """Logs energies of both phases and their contrast.
 
     ``contrast`` is the loss of the pass's last update, before its step. ``energy_data``, ``energy_model`` and
-    ``energy_model_lowest`` are energies of the same states under the updated model. Their distributions are
-    :class:`EnergyHistograms`' to draw, and what the sampler reports is :class:`SamplerDiagnostics`' to log.
+    ``energy_model_lowest`` are energies of the same states under the updated model. :class:`EnergyHistograms`
+    draws how they are distributed; :class:`SamplerDiagnostics` logs what the sampler reports.
 
     Args:
         every: Passes between two values, >= 1.

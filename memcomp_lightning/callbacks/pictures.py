@@ -82,7 +82,7 @@ class ReceptiveFields(Pictures):
 
 
 class ModelSamples(Pictures):
-    """Draws images that the model dreams: Gibbs chains from random states, shown as conditional means.
+    """Draws samples that show what the model has learnt: Gibbs chains from random states, as conditional means.
 
     The chains have a random stream of their own, so they do not touch training.
 

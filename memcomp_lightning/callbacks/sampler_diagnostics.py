@@ -23,8 +23,8 @@ class SamplerDiagnostics(EveryIterations):
       :func:`autocorrelation_time`. It needs at least two looks and two chains. A value above a tenth of the
       passes that ``history`` spans means "at least so much".
 
-    Chains persist if the state that the module's ``sampler`` begins with holds visible states, and in modules
-    without one; weighted configurations are no chains. The series starts afresh with each layer, and is in
+    Chains count as persistent if the state that ``sampler.init`` returns holds visible states, or if there is no
+    ``sampler``; weighted configurations are no chains. The series starts afresh with each layer, and is in
     checkpoints. With several processes all values are those of the first.
 
     Args:

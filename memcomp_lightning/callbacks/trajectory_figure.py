@@ -16,7 +16,7 @@ from memcomp_lightning.solvers.dmm import DmmSolver, Recording
 
 
 class TrajectoryFigure(EveryIterations):
-    """Lets a machine look for the ground state of the first replica, and draws ``trajectory``.
+    """Draws how a memcomputing machine finds the ground state of the first replica, as picture ``trajectory``.
 
     The picture is that of Manukian et al. 2019, Fig. 2, by :func:`memcomp_lightning.plotting.plot_trajectory`. The
     machine has a random stream of its own and the same start each time, so that pictures compare, and runs on the

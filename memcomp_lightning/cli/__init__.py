@@ -1,1 +1,1 @@
-"""The command line: arguments in, words out."""
+"""The command line: reads and checks arguments, runs the commands, prints what they found."""

@@ -1,4 +1,4 @@
-"""The command line as typed: which of Hydra's flags it has, and overrides that Hydra reads as they were meant."""
+"""Reads what was typed: Hydra's flags, and overrides, rewritten so that Hydra reads them as they were meant."""
 
 import glob
 import re
@@ -202,7 +202,7 @@ def _one_value(name: str, text: str) -> str:
 
 
 def _path(name: str, text: str, *, swept: bool) -> str:
-    """A path, in quotes where Hydra needs them, so that a file is called as it likes."""
+    """A path, in quotes where Hydra needs them, so that a file may have any name."""
     if not text.strip(" '\"") and name != "problem":
         raise UserError(f"{name}={text} names no path: write {name}=PATH")
     text = "null" if text.strip() == "None" and not _is_file(text) else text
@@ -242,7 +242,7 @@ def with_path(name: str, path: Path | str) -> str:
 
 
 def _value(text: str) -> Any:
-    """What Hydra reads; a text that it cannot read is given a trailing quote, so that it equals nothing."""
+    """The value that Hydra reads; ``_Unreadable``, which equals no value, where it cannot read the text."""
     try:
         (parsed,) = OverridesParser.create().parse_overrides([f"x={text}"])
     except HydraException:
@@ -380,7 +380,7 @@ def _trouble(override: str) -> str:
         return f"{name} is no name of a setting: expected NAME=VALUE."
     if text.endswith("()"):
         return f"{text} has no values."
-    return f"a text with such signs stands in quotes: {_for_shell(name, text)}"
+    return f"a text with such signs needs quotes. Write {_for_shell(name, text)}"
 
 
 def _for_shell(name: str, text: str) -> str:

@@ -1,4 +1,4 @@
-"""What a command prints: a line that cannot be printed is lost alone, never the work that it tells of."""
+"""Prints what a command says; a line that cannot be printed is lost, but the command goes on."""
 
 import codecs
 import errno
@@ -19,7 +19,7 @@ USAGE_ERROR = 2
 
 
 def refuse(command: str, error: Exception) -> NoReturn:
-    """End with the message alone."""
+    """End the command with an error message, without a traceback."""
     say(f"{command}: {error}", error=True)
     sys.exit(USAGE_ERROR)
 
@@ -49,7 +49,7 @@ def tolerant_streams() -> Iterator[list[OSError]]:
 
 
 def make_tolerant() -> list[OSError]:
-    """Do the same for the rest of this process, which a launcher may have started; return the list."""
+    """As :func:`tolerant_streams`, for the rest of this process, which a launcher may have started."""
     codecs.register_error("readable", _spelt_out)
     failures: list[OSError] = []
     for number, name in ((1, "stdout"), (2, "stderr")):

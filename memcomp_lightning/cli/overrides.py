@@ -1,4 +1,4 @@
-"""The command line before Hydra sees it: every job is composed and checked, and nothing is written."""
+"""Composes and checks every job of a command line before Hydra starts one, so that mistakes show at once."""
 
 import hashlib
 import itertools
@@ -173,7 +173,7 @@ def _composed(config_name: str, job: Sequence[str], paths: Sequence[str]) -> Dic
 
 
 def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[str]) -> None:
-    """Refuse what no group can be: taken away, added to itself, or given something else than an option's name."""
+    """Refuse to take a group away, to add it a second time, or to give it anything but the name of an option."""
     parsed = [parse(override) for override in overrides]
     if not any(o.key_or_group and "." not in o.key_or_group for o in parsed):
         return

@@ -53,7 +53,7 @@ def with_choice(config: DictConfig, value: float) -> DictConfig:
 
 
 def for_trial(config: DictConfig, value: float) -> DictConfig:
-    """The same with images held out to judge the value by."""
+    """A copy in which the setting has this value, and images are held out to judge it by."""
     chosen = with_choice(config, value)
     chosen.data.validation_fraction = config.data.validation_fraction or HELD_OUT
     return chosen

@@ -19,7 +19,10 @@ from memcomp_lightning.studies.likelihood import pretraining_of
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.worth import Comparison, Method
 
-_SET_BY_COMPARISON = {"pretrain.iterations": "It has passes of its data sets.", "sampler": "It has methods."}
+_SET_BY_COMPARISON = {
+    "pretrain.iterations": "Use worth.data_sets.NAME.passes.",
+    "sampler": "Each of worth.methods has its own.",
+}
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:

@@ -33,11 +33,11 @@ def search_paths(overrides: Iterable[str]) -> list[str]:
 
 
 def composed_for(common: Iterable[str], own: Iterable[str] = ()) -> DictConfig:
-    """The configuration of one curve or method, without its study; composed once, and not to be changed.
+    """The configuration of one curve or method, without settings of its study; cached, so do not change it.
 
     Args:
-        common: Overrides of all. Those that this one has no setting for are left out: ``solver.max_steps`` where
-            its solver is descent.
+        common: Overrides of the whole study. Those for which this curve or method has no setting are left out:
+            ``solver.max_steps`` where its solver is descent.
         own: Its own overrides, which must apply.
     """
     common = tuple(common)

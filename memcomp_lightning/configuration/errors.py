@@ -1,4 +1,4 @@
-"""Errors of configurations as a user meets them: one message, no stack of frames from libraries."""
+"""Turns the errors of a configuration into one message for the user, without a traceback."""
 
 import difflib
 from collections.abc import Collection
@@ -56,7 +56,7 @@ def explain(error: BaseException) -> str:
 
 
 def in_words(error: BaseException) -> str:
-    """The message of an error; what it means where Python's own words say it to programmers alone."""
+    """The message of an error, in plain words where Python's own are for programmers."""
     compared, _, kinds = str(error).partition(" not supported between instances of ")
     if isinstance(error, TypeError) and compared and "'str'" in kinds:
         return "text is given where a number is expected."

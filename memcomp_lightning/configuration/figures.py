@@ -30,7 +30,7 @@ _SET_BY_CURVES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """Networks that differ in what the figure varies alone.
+    """Networks that differ only in what the figure varies.
 
     Attributes:
         label: For people.

@@ -160,7 +160,7 @@ def plan_of(settings: Mapping[str, Any]) -> Plan:
 
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:
-    """Refuse what changes training and is not there in a loop without a trainer.
+    """Refuse callbacks and limits that change training: a loop without a trainer would leave them out.
 
     Raises:
         SettingError: Naming the callback or the setting.

@@ -76,7 +76,7 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
             trainer = trainer_of(stage, config, folder, loggers)
             check_trainer(trainer)
             of_its_own = isinstance(trainer.strategy.launcher, _MultiProcessingLauncher)
-            allowed = "one whose processes run the command as this one does"
+            allowed = "one that starts its processes by the command, not by fork or spawn"
             strategy = config.trainer.strategy
             require(not of_its_own, "trainer.strategy", strategy, allowed, "Use trainer.strategy=ddp.")
         except (MisconfigurationException, RuntimeError) as error:

@@ -1,4 +1,4 @@
-"""Values of settings against what their constructors ask for, before one of them is called."""
+"""Checks the values of settings against what their constructors accept, before one of them is called."""
 
 import dataclasses
 import inspect
@@ -37,7 +37,7 @@ def check_values(settings: DictConfig) -> None:
 
 
 def _check_finite(node: Any, name: str = "") -> None:
-    """Optimisers, samplers and solvers would take some NaN or infinity."""
+    """Refuse NaN and infinity, which some optimisers, samplers and solvers would accept."""
     if isinstance(node, DictConfig):
         for key in node:
             if not OmegaConf.is_interpolation(node, str(key)):
@@ -72,7 +72,7 @@ def check_kinds(settings: DictConfig, name: str = "") -> None:
 
 
 def filled(schema: type[T], settings: DictConfig, name: str) -> T:
-    """Settings as the object of a dataclass, which says what there is and of which kind.
+    """Fill a dataclass from settings; its fields say which settings there are, and of which kind.
 
     Args:
         schema: The dataclass, perhaps of dataclasses; its constructor says what is in range.
@@ -87,7 +87,7 @@ def filled(schema: type[T], settings: DictConfig, name: str) -> T:
         require_choice(f"setting of {name}", str(key), tuple(hints))
     for field in known:
         given = field.name in settings or field.default is not dataclasses.MISSING
-        require(given, f"{name}.{field.name}", None, "a setting of each")
+        require(given, f"{name}.{field.name}", None, "a value, because it has no default")
     return schema(**{str(key): _as(hints[str(key)], settings[key], f"{name}.{key!s}") for key in settings})
 
 

@@ -98,7 +98,7 @@ class ImageData:
 
 
 class ImageSource(Protocol):
-    """A data set by its settings; making one reads nothing."""
+    """The settings of a data set; nothing is read before ``load``."""
 
     def load(self) -> ImageData:
         """Return the images, from memory, from disk or from the network."""

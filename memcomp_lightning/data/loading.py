@@ -55,10 +55,10 @@ class SparseRows(NamedTuple):
 
 
 class Batches:
-    """One pass over the images, as :class:`~memcomp_lightning.types.Batch` objects; an epoch each time.
+    """Deals images in memory out to updates, a pass at a time, as :class:`~memcomp_lightning.types.Batch` objects.
 
-    The order of an epoch depends on the seed and on the epoch alone, so a resumed run needs no saved order to
-    continue as the uninterrupted one; only a checkpoint from within an epoch has to say how far the epoch was
+    The order of a pass depends on the seed and the number of the pass alone, so a resumed run goes on like an
+    uninterrupted one without a saved order; only a checkpoint from within a pass has to say how far it was
     (:meth:`state_dict`). Each replica has its own order.
 
     A step's images are dealt to the processes (process r takes every ``world_size``-th, from the r-th on),

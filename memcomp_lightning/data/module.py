@@ -19,11 +19,11 @@ class ImageDataModule(LightningDataModule):
     left over. How the set is dealt depends on ``partition_seed`` alone, so the parts stay the same when the
     seed of the training varies.
 
-    Evaluation runs unshuffled, all of it in each process. It is one step in chunks: the sum of
+    Held-out and test images come unshuffled, all of them in each process, as one step in chunks: the sum of
     ``share * mean over the chunk`` is the mean over the set.
 
     Attributes:
-        replicas: Leading axes of the batches: ``()``, or ``(partitions,)``.
+        replicas: Leading axes of the batches: ``()``, or the number of parts in use, ``(n,)``.
         n_train: Training images of one replica, without those held out.
 
     Args:

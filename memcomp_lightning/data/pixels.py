@@ -15,7 +15,7 @@ Pixels = Literal["grey", "threshold", "stochastic"]
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GreySource(ABC):
-    """What all sources of grey images share: what their inputs are.
+    """Base of the sources of grey images: settles whether the inputs are grey values or bits.
 
     Args:
         pixels: ``grey``: intensities in [0, 1]. ``threshold``: 1 where the intensity is above ``threshold``,

@@ -21,7 +21,7 @@ PRECISIONS = (np.float64, np.float32)
 
 
 class MemcompEstimator(NestedSettings):
-    """Reads dense and sparse inputs in float64 or float32 and scales what leaves [0, 1]."""
+    """Base of both estimators: reads dense and sparse inputs, float64 or float32; scales what leaves [0, 1]."""
 
     _scaling: Scaling
 
@@ -50,7 +50,7 @@ class MemcompEstimator(NestedSettings):
 
     def _refuse_early_stopping(self) -> None:
         if self.early_stopping:
-            raise ValueError("partial_fit does not support early_stopping=True: it sees a part of the data.")
+            raise ValueError("partial_fit sees a part of the data: set early_stopping=False for it, or use fit.")
 
     def _say(self, done: int, of: int, score: float | None) -> None:
         if self.verbose:

@@ -52,9 +52,9 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
 
     Inputs are scaled, and their precision is kept, as in :class:`MemcompRBM`.
 
-    Samples with the label -1 have none, as in scikit-learn's semi-supervised estimators: layers are pretrained on
-    them as well, and -1 is no class. Only where -1 and 1 are all the labels both are classes. Among strings it is
-    the number -1 in an array of objects; the string "-1" is a label.
+    The label -1 marks samples without a label, as in scikit-learn's semi-supervised estimators: layers are
+    pretrained on them as well, and -1 is no class. If -1 and 1 are the only labels, both are classes. Beside
+    strings the mark is the number -1, in an array of objects; the string "-1" is a label.
 
     Args:
         hidden_layer_sizes: Units of each hidden layer; an integer for one layer.
@@ -219,8 +219,8 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
             given = self.classes_.tolist()
             del self.classes_
             raise ValueError(
-                f"classes holds {UNLABELLED}, which marks unlabelled samples, among {given}: leave it out. Only "
-                "beside 1 alone it is a class."
+                f"classes holds {UNLABELLED}, which marks unlabelled samples, among {given}: leave it out. It is "
+                "a class only if the classes are -1 and 1."
             )
         X, y = self._read_labelled(X, y, reset=begins)
         weight = weights_of(sample_weight, X)

@@ -30,8 +30,8 @@ class Scaling:
     """Maps the columns that leave [0, 1] in the training data to [0, 1] by their range, and clips all.
 
     Attributes:
-        low: What becomes 0, a number a column; 0 in the columns that are left as they are.
-        width: By how much more something becomes 1; 1 in the columns that are left as they are.
+        low: The value that becomes 0, for each column; 0 in the columns that are left as they are.
+        width: The value that becomes 1, less ``low``; 1 in the columns that are left as they are.
     """
 
     low: NDArray[Any]
@@ -115,10 +115,10 @@ def batches_of(
 ) -> Batches:
     """Return the batches of scaled data, whose weights are > 0.
 
-    In mini-batches a sample of weight 2 is the same as the sample twice: samples of whole weights are repeated. Of
-    other weights, or large ones, a sample of r times the mean weight is laid out as r copies, rounded up, that
-    share its weight: no batch is all one heavy sample, and no step is far longer than the others. The order in
-    which the samples are given does not matter.
+    In mini-batches a sample of weight 2 is the same as the sample twice: if all weights are integers with a mean
+    up to ``MOST_REPEATS``, samples are repeated by their weights. Otherwise a sample of r times the mean weight
+    becomes r copies, rounded up, that share its weight: so no batch is all one heavy sample, and no step is far
+    longer than the others. The order in which the samples are given does not matter.
     """
     n_counted = X.shape[0] if weight is None else float(weight.sum())
     if batch_size is not None and batch_size < max(X.shape[0], n_counted):
@@ -129,7 +129,7 @@ def batches_of(
     n, n_features = X.shape
     size = None if batch_size is None or batch_size >= n else batch_size
     chunk = max(1, MOST_NUMBERS // n_features) if sp.issparse(X) else 10_000
-    # A mode-assisted step is one toss of its coin, so it is not cut.
+    # Mode assistance draws for each chunk whether the mode is used, so a step must be one chunk.
     chunk = n if isinstance(sampler, ModeAssisted) else max(chunk, size or 0)
     labels = torch.zeros(n, dtype=torch.long) if label is None else torch.from_numpy(label).long()
     weights = None if weight is None else torch.from_numpy(weight)

@@ -51,10 +51,10 @@ MOST_ENUMERATED = 20
 class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstimator):  # type: ignore[misc]
     """Bernoulli RBM whose negative phase is any sampler of this package.
 
-    Values in [0, 1] stand for probabilities. Columns within [0, 1] are left as they are; one that leaves [0, 1] is
-    scaled to it by its range in ``fit``, and a constant one outside counts as 0 below and as 1 above. Later values
-    are clipped. Dense and sparse (CSR) inputs give the same; of a sparse one no more than a mini-batch is made
-    dense. Training and results are in the precision of the input, float32 or float64.
+    Values in [0, 1] stand for probabilities. A column that is within [0, 1] in ``fit`` is left as it is. One that
+    is not is scaled to [0, 1] by its range; if it is constant, it becomes 0 (below 0) or 1 (above 1). Later values
+    beyond are clipped. Dense and sparse (CSR) inputs give the same; of a sparse one no more than a mini-batch is
+    made dense. Training and results are in the precision of the input, float32 or float64.
 
     The visible biases start at the log odds of the data's means (Hinton 2010, section 8).
 

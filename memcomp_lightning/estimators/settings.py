@@ -1,4 +1,4 @@
-"""Settings that are frozen dataclasses, set and listed like those of nested estimators."""
+"""Lets ``set_params`` and searches reach into samplers, which are frozen dataclasses: ``sampler__k``."""
 
 import dataclasses
 from abc import abstractmethod

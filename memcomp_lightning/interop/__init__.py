@@ -1,4 +1,4 @@
-"""Our solvers in dimod, and D-Wave's annealers: each needs its own package, and says which where it is missing."""
+"""Use our solvers in dimod, and D-Wave's annealers here; where a package for it is missing, an error names it."""
 
 from memcomp_lightning.interop.annealer_graph import annealer_graph
 from memcomp_lightning.optional import on_demand

@@ -38,11 +38,12 @@ class Layout(NamedTuple):
 
 
 class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
-    """Boltzmann machines on a quantum annealer: a chain of qubits a unit, gauges, one scale.
+    """Sample Boltzmann machines on a quantum annealer; each unit becomes a chain of qubits.
 
-    An RBM is laid out as a biclique, visible chains across hidden chains, other machines as a search finds it;
-    that is done once for a graph. Problems keep the scale they come with (``auto_scale`` is off), which is what
-    an effective temperature is known of; one beyond the range of the qubits is shrunk, with a warning.
+    An RBM is laid out as a biclique, visible chains across hidden chains; for other machines an embedding is
+    searched for. Either is done once for each graph. Problems keep the scale they come with (``auto_scale`` is
+    off), as an effective temperature holds for one scale only; a problem beyond the range of the qubits is shrunk,
+    with a warning.
 
     Args:
         qpu: The annealer, a structured sampler; None connects to D-Wave's service, as its configuration says.
@@ -166,7 +167,7 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
     def _fit(self, target: Any) -> None:
         """Shrink a problem that is beyond the range of the qubits.
 
-        A gauge turns signs: what D-Wave's extended range allows ferromagnetic couplings alone is no use.
+        The smaller end of each range counts: gauges turn signs, and D-Wave's extended range is wider for one only.
         """
         ranges = {"h_range": target.linear.values(), "j_range": target.quadratic.values()}
         excess = max(
@@ -177,8 +178,8 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         if excess > 1:
             if not self._warned:
                 log.warning(
-                    "The annealer is given its largest fields and couplings: the model at the given temperature "
-                    "is %.3g times beyond. Samples are hotter than beta says; weight decay keeps a model smaller.",
+                    "At the given temperature the model is %.3g times beyond the annealer's range and is shrunk. "
+                    "Samples are hotter than beta says; weight decay keeps a model smaller.",
                     excess,
                 )
                 self._warned = True

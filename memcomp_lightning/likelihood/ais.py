@@ -1,4 +1,4 @@
-"""Estimates of log Z by annealed importance sampling, up from an RBM without couplings and back down."""
+"""Estimate log Z of models too large to be enumerated, by annealed importance sampling, from below and above."""
 
 import math
 from collections.abc import Sequence
@@ -50,7 +50,9 @@ class AisEstimate(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Ais:
-    r"""Annealed importance sampling from an RBM without couplings (Neal 2001; Salakhutdinov & Murray 2008).
+    r"""Estimates log Z of models too large to be enumerated; the estimate is too low on average.
+
+    Annealed importance sampling from an RBM without couplings (Neal 2001; Salakhutdinov & Murray 2008):
 
     .. math:: p_\beta(v) \propto exp((1 - \beta) b_0.v + \beta b.v) \prod_i (1 + exp(\beta (W v + c)_i))
 
@@ -112,7 +114,7 @@ class Ais:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ReverseAis:
-    r"""The path of :class:`Ais` downwards, from samples of the model.
+    r"""Estimates log Z from above, to see how far :class:`Ais` is off: the same path, from samples of the model.
 
     The mean weight is Z_0 / Z without bias; log Z is therefore too high on average. With ``Ais`` it brackets log Z
     (Burda et al. 2015; Grosse et al. 2015) - but only if the samples are the model's own: exact ones

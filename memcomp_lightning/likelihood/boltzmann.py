@@ -18,7 +18,7 @@ _NUMBERS = 2**23
 
 
 def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
-    """A base of visible units as one of the units of the first class, zero for the hidden ones among them."""
+    """Turn a base for the visible units into one for the first class, with zeros for its hidden units."""
     units = model.classes[0]
     wide = base.new_zeros(*base.shape[:-1], model.n_units)
     wide[..., : model.n_visible] = base
@@ -122,5 +122,5 @@ def _require_few(n_units: int, max_units: int) -> None:
         "units outside the largest class",
         n_units,
         f"at most max_units = {max_units}, because all their states are enumerated",
-        "Use Ais for machines of two classes, or a smaller one.",
+        "Use Ais if the machine has two classes of units; otherwise use a smaller machine.",
     )

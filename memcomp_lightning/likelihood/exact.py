@@ -1,4 +1,4 @@
-"""Exact likelihoods of an RBM one of whose layers can be enumerated, and what needs no partition function."""
+"""Exact likelihoods of models small enough to be enumerated, and pseudo-likelihoods, which need no log Z."""
 
 from collections.abc import Callable
 
@@ -36,7 +36,7 @@ def log_partition_function(
 
     over the states s of the smaller layer, with bias g, and the units i of the other one. Time grows as
     2^n_smaller n_other, about 5e9 such pairs a second and CPU thread. A Boltzmann machine of two classes of units
-    is such an RBM (:func:`folded`); of any other all units outside the largest class are enumerated.
+    is taken as such an RBM (``two_layers``); of any other all units outside the largest class are enumerated.
 
     Args:
         model: The model, of any dtype; the sum is done in float64.
@@ -99,7 +99,7 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
     cumulative = torch.softmax(log_weight, dim=-1).cumsum(-1)
     cumulative = cumulative / cumulative[..., -1:]
     u = rng.uniform((*cumulative.shape[:-1], n), generator=generator, like=cumulative)
-    # To the right of equal values: a state of probability zero is never drawn.
+    # right=True finds the first value above u, so that a state of probability zero is never drawn.
     return torch.searchsorted(cumulative, u, right=True)
 
 

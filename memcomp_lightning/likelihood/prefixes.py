@@ -89,7 +89,7 @@ def _cpu() -> ModuleType | None:
     try:
         from memcomp_lightning.likelihood import cpu
     except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
-        log.info("numba: %s. The plain torch program is many times slower; try NUMBA_CACHE_DIR.", error)
+        log.info("numba: %s. Plain torch is used, many times slower. Install numba or set NUMBA_CACHE_DIR.", error)
         return None
     return cpu
 

@@ -17,7 +17,7 @@ Readout = Literal["mean", "sample"]
 
 
 class Block(NamedTuple):
-    """Units without couplings among them, with all that they are coupled to, at the present parameters.
+    """What it takes to draw one class of units given all others: its couplings and biases, as they are now.
 
     Attributes:
         units: Their indices, ``(n_class,)``.
@@ -51,18 +51,18 @@ class QuadraticForm(NamedTuple):
 
 
 class TwoLayers(NamedTuple):
-    """A model whose units fall into two classes, as the RBM between them.
+    """A model of two classes of units seen as an RBM, so that what is made for RBMs works for it.
 
     Attributes:
         rbm: It has the model's energies, with the first class as its visible units.
-        units: The model's units in the order of the RBM's; None if they are in their places.
+        units: For each unit of the RBM its number in the model; None if the order is the same.
     """
 
     rbm: "RBM"
     units: Tensor | None
 
     def first(self, x: Tensor) -> Tensor:
-        """The part of the first class of something that all units have."""
+        """Take from ``x``, ``(..., n_units)``, the entries of the units of the first class."""
         units = slice(self.rbm.n_visible) if self.units is None else self.units[: self.rbm.n_visible]
         return x[..., units]
 
@@ -70,8 +70,8 @@ class TwoLayers(NamedTuple):
 class Chains(Protocol):
     """Gibbs chains of one model at its present parameters.
 
-    A chain's state is ``x``, ``(*replicas, n, n_units)``: the visible units of two layers, whose hidden ones are
-    redrawn from them; all units otherwise.
+    A chain's state is ``x``, ``(*replicas, n, n_units)``. In an RBM it holds the visible units alone, because a
+    sweep draws the hidden ones anew from them; in other models it holds all units.
     """
 
     free_readout: bool
@@ -90,7 +90,7 @@ class Chains(Protocol):
         ...
 
     def read(self, x: Tensor) -> Configurations:
-        """The states, with the class that was drawn last by its means given the others."""
+        """Return the states, one class (in an RBM the hidden units) replaced by its means given the others."""
         ...
 
     def from_data(
@@ -104,7 +104,7 @@ class Chains(Protocol):
 
 
 class EnergyModel(Protocol):
-    """Visible and hidden units in {0, 1} with the energy of each joint state, one model a replica.
+    """What a model must offer to be trained and measured: units in {0, 1}, their energies, means and chains.
 
     The energy is linear in each unit: at values in [0, 1] it is the expected one of independent units.
     """
@@ -134,7 +134,7 @@ class EnergyModel(Protocol):
 
     @property
     def n_enumerated(self) -> int:
-        """Units whose states are enumerated where something is exact: all outside the largest class."""
+        """Number of units whose states exact computations enumerate: all outside the largest class."""
         ...
 
     def double(self) -> Self:
@@ -181,7 +181,7 @@ class EnergyModel(Protocol):
         ...
 
     def all_configurations(self) -> Configurations:
-        """All states with their probabilities as weights, the largest class by its means given the others."""
+        """All states outside the largest class with their probabilities as weights; that class by its means."""
         ...
 
     def quadratic_form(self) -> QuadraticForm:
@@ -205,8 +205,8 @@ def as_two_layers(model: EnergyModel) -> TwoLayers:
             False,
             "number of classes of units",
             len(model.classes),
-            "2: connectivity without odd circles, as in an RBM, a DBM or a grid",
-            "Other machines can be enumerated up to 32 units outside the largest class.",
+            "2, with couplings only between them, as in an RBM, a DBM or a grid",
+            "For other machines use log_partition_function, up to 32 units outside the largest class.",
         )
         raise AssertionError
     return layers

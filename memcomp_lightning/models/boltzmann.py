@@ -40,12 +40,13 @@ _INDICES = ("units", "neighbours", "edge", "slot")
 
 
 class BoltzmannMachine(nn.Module):
-    r"""Units x = (v, h) in {0, 1} with couplings between any pairs.
+    r"""A model of binary data v with hidden units h: x = (v, h) in {0, 1}, with couplings between any pairs.
 
     .. math:: E(x) = -\sum_{(i, j)} w_{ij} x_i x_j - \sum_i a_i x_i, \qquad a = (b, c)
 
-    (Ackley, Hinton & Sejnowski 1985.) Units are coloured so that no two of a class are coupled; a class is drawn,
-    or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent units.
+    (Ackley, Hinton & Sejnowski 1985.) The units are split into classes without couplings inside, so that a class
+    is drawn, or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent
+    units.
 
     Attributes:
         pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first; part of the state dict, so that
@@ -53,7 +54,7 @@ class BoltzmannMachine(nn.Module):
         coupling: w, one number a pair, ``(*replicas, n_pairs)``.
         b: Visible bias, ``(*replicas, n_visible)``.
         c: Hidden bias, ``(*replicas, n_hidden)``.
-        classes: Indices of the units of each colour; those with more visible units come first.
+        classes: Indices of the units of each class; classes with more visible units come first.
 
     Args:
         n_visible: Number of visible units, >= 1.
@@ -122,8 +123,8 @@ class BoltzmannMachine(nn.Module):
         """Say what speaks against couplings of these pairs in this machine; empty if nothing does.
 
         Args:
-            pairs: Those of a weight file; None if it has none, as files of version 0.1, which is understood where
-                the number of units says what they are.
+            pairs: Those of a weight file; None if it has none, as files of version 0.1. They are then taken to be
+                all pairs of units, and refused in any other machine.
         """
         if pairs is None:
             known = len(self.pairs) == self.n_units * (self.n_units - 1) // 2
@@ -173,7 +174,7 @@ class BoltzmannMachine(nn.Module):
 
     @property
     def bias(self) -> Tensor:
-        """A = (b, c), ``(*replicas, n_units)``."""
+        """Biases of all units, a = (b, c), ``(*replicas, n_units)``."""
         return torch.cat((self.b, self.c), dim=-1)
 
     @property
@@ -204,7 +205,7 @@ class BoltzmannMachine(nn.Module):
 
     @property
     def n_enumerated(self) -> int:
-        """Units whose states are enumerated where something is exact: all outside the largest class."""
+        """Number of units whose states exact computations enumerate: all outside the largest class."""
         return self.n_units - max(len(units) for units in self.classes)
 
     @torch.no_grad()

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def sweep(model: "RBM", v: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
     """Draw h given v, then v given h, at inverse temperature ``beta``; return the new v.
 
-    Leaves ``p(v)^beta``-tempered equilibrium, ``exp(-beta E) / Z(beta)``, invariant. Real-valued ``v`` is
-    taken as it is in the first half of the sweep.
+    Leaves the distribution ``exp(-beta E) / Z(beta)`` invariant. Values of ``v`` between 0 and 1 are taken as
+    they are in the first half of the sweep.
     """
     h = rng.bernoulli(model.hidden_mean(v, beta=beta), generator=generator)
     return rng.bernoulli(model.visible_mean(h, beta=beta), generator=generator)
@@ -31,7 +31,7 @@ def random_states(model: EnergyModel, n: int, n_units: int, *, generator: Genera
 
 
 class TwoLayerChains:
-    """Chains of visible units.
+    """Gibbs chains of an RBM; a state is its visible units, from which each sweep draws the hidden ones anew.
 
     Args:
         model: The model.

@@ -113,7 +113,7 @@ def colouring(n_units: int, pairs: Pairs) -> list[Int[Tensor, " n_class"]]:
     """Split the units into classes without couplings inside, so that a class can be drawn at once.
 
     Two classes where two suffice (an RBM, a DBM, a grid); otherwise the better of two greedy colourings, outwards
-    from the first unit and by degree. At most one class more than a unit has couplings.
+    from the first unit and by degree. There are at most k + 1 classes if no unit has more than k couplings.
 
     >>> [units.tolist() for units in colouring(4, grid(2, 2))]
     [[0, 3], [1, 2]]

@@ -15,7 +15,7 @@ from memcomp_lightning.models.init import Gaussian, Initialiser
 
 
 class DBM(BoltzmannMachine):
-    r"""Each layer is coupled to the next; a Boltzmann machine whose mask says so.
+    r"""Several hidden layers that are trained together: a Boltzmann machine, each layer coupled to the next.
 
     .. math:: E(v, h_1, h_2, \ldots) = -h_1^T W_1 v - h_2^T W_2 h_1 - \ldots - b^T v - \sum_l c_l^T h_l
 
@@ -82,15 +82,15 @@ class DBM(BoltzmannMachine):
         ]
 
     def hidden_layers(self, h: Float[Tensor, "*axes n_hidden"]) -> tuple[Float[Tensor, "*axes n_layer"], ...]:
-        """The part of each layer of something that all hidden units have."""
+        """Split ``h``, which has an entry for each hidden unit, into its layers, the lowest first."""
         return tuple(h.split(self.sizes[1:], dim=-1))
 
     @torch.no_grad()
     def take(self, dbn: DBN) -> None:
         """Take weights and biases of a DBN of the same sizes.
 
-        The bias of a hidden layer is that of its RBM and, where the RBM above has visible biases of its own for
-        these units, theirs added: a bias that both learned is in both.
+        The bias of a hidden layer is the hidden bias of its RBM plus the visible bias of the RBM above, because
+        both are biases of these units.
 
         Raises:
             SettingError: The DBN has other sizes.
@@ -103,9 +103,9 @@ class DBM(BoltzmannMachine):
 
     @torch.no_grad()
     def give(self, dbn: DBN) -> None:
-        """Set a DBN of the same sizes to these weights and biases; visible biases above the first layer to zero.
+        """Copy weights and biases to a DBN of these sizes; its visible biases above the first layer become zero.
 
-        ``take`` undoes it.
+        ``take`` of that DBN gives the same machine again.
 
         Raises:
             SettingError: The DBN has other sizes.

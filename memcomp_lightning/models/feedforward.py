@@ -99,7 +99,9 @@ class BatchNorm(nn.Module):
 
 
 class BatchNormReluNetwork(nn.Module):
-    """The paper's baseline (Fig. 6): linear, batch normalisation, ReLU for each hidden layer; linear output.
+    """The network without pretraining that DBNs are compared with (Manukian et al. 2019, Fig. 6).
+
+    Each hidden layer is linear, batch normalisation, ReLU; the output is linear.
 
     Args:
         n_visible: Number of inputs.

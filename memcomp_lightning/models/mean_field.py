@@ -34,13 +34,13 @@ def mean_field(
     max_iterations: int = 30,
     tolerance: float = 1e-3,
 ) -> MeanFieldSolution:
-    r"""Iterate ``m_i = sigmoid(field_i)`` over the free units, class by class, from 1/2.
+    r"""Approximate the means of the free units: iterate ``m_i = sigmoid(field_i)``, class by class, from 1/2.
 
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
     p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration
-    is exact if no two free units are coupled. Each configuration stops when none of its means changes by more than
-    the tolerance, whatever the others do: its means do not depend on what it is batched with. Or it says that it
-    did not converge.
+    is exact if no two free units are coupled. Each configuration stops on its own when all its means change by
+    less than the tolerance, so that they do not depend on the rest of the batch. If one does not get there in
+    ``max_iterations``, ``converged`` of its replica is False.
 
     Args:
         model: The machine.

@@ -1,4 +1,4 @@
-"""What is left of pretrained layers without what they learned: controls between pretraining and fine-tuning."""
+"""Controls that destroy what pretraining learned and keep the size of the weights, to see which of them helps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -19,7 +19,7 @@ from memcomp_lightning.types import Configurations
 
 
 class RBM(nn.Module):
-    r"""Visible and hidden units in {0, 1} with couplings between the two layers only.
+    r"""A model of binary data: visible units hold it, hidden units explain it, couplings join the two layers only.
 
     .. math:: E(v, h) = -\sum_{ij} w_{ij} h_i v_j - \sum_j b_j v_j - \sum_i c_i h_i
 
@@ -181,7 +181,7 @@ class RBM(nn.Module):
 
     @property
     def n_enumerated(self) -> int:
-        """Units whose states are enumerated where something is exact: those of the smaller layer."""
+        """Number of units whose states exact computations enumerate: those of the smaller layer."""
         return min(self.n_visible, self.n_hidden)
 
     @torch.no_grad()

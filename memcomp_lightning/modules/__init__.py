@@ -1,4 +1,4 @@
-"""LightningModules: a stage of training each."""
+"""The LightningModules, each for one stage of training: pretraining or fine-tuning."""
 
 from memcomp_lightning.modules.baseline import BaselineClassifier
 from memcomp_lightning.modules.classifier import Classifier

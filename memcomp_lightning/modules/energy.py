@@ -38,10 +38,11 @@ CENTRED = Centring(rate=defaults.CENTRING_RATE)
 
 
 class EnergyPretraining(StageModule):
-    """Follow the gradient of the contrast of both phases, for one energy model after the other.
+    """Pretrains energy models one after the other, by the gradient of mean E(data) - mean E(negative phase).
 
-    A wish to stop ends the training of the model at hand, and the next one begins. An ``EarlyStopping`` starts
-    afresh with each model, and one that monitors a value of one layer means the same value of each.
+    If a callback or a limit asks to stop, only the training of the present model ends, and the next one begins.
+    An ``EarlyStopping`` starts afresh with each model; if it monitors a value of one layer, it follows the same
+    value of each layer in turn.
 
     Args:
         pretraining: Way of pretraining, with its network: ``Greedy(dbn)``, ``Joint(dbn)``, ``Boltzmann(machine)``.
@@ -98,11 +99,11 @@ class EnergyPretraining(StageModule):
 
     @property
     def n_models(self) -> int:
-        """One a phase."""
+        """Models that are trained, one for each phase."""
         return len(self.phases)
 
     def record(self) -> dict[str, Any]:
-        """The same with the energy gaps and the names of the models."""
+        """What the stage did, as plain values, with the energy gaps and the names of the models."""
         gaps = [gap.reshape(-1).tolist() for gap in self.energy_gaps]
         return {**super().record(), "energy_gap": gaps, "trained": [phase.name for phase in self.phases]}
 
@@ -113,12 +114,12 @@ class EnergyPretraining(StageModule):
 
     @property
     def phase(self) -> Phase:
-        """The present one."""
+        """The phase in training."""
         return self.phases[self.layer]
 
     @property
     def model(self) -> EnergyModel:
-        """The one in training."""
+        """The energy model in training."""
         return self.phase.model
 
     @property
@@ -232,7 +233,7 @@ class EnergyPretraining(StageModule):
         self.trainer.fit_loop.min_epochs = self._begun_at[-1] + self._fewest_passes if is_last else sys.maxsize
 
     def monitored(self, name: str) -> str:
-        """The name under which a value that somebody monitors is logged for the model in training."""
+        """The tag to monitor now: ``pretrain/layer1/x`` becomes ``pretrain/layer2/x`` while layer 2 trains."""
         tags = "|".join(re.escape(phase.tag) for phase in self.phases)
         return re.sub(rf"^{self.stage}/({tags})/", f"{self.log_prefix}/", name) if tags else name
 
@@ -322,7 +323,7 @@ class _OfTrainer:
         return cast(Tensor, self._trainer.strategy.reduce(value, reduce_op="mean"))
 
     def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
-        """What the process of rank 0 makes, in all of them."""
+        """Call ``make`` in the process of rank 0 alone, and return its result in all of them."""
         if self._trainer.world_size == 1:
             return make()
         made = make() if self._trainer.is_global_zero else None

@@ -23,7 +23,7 @@ class NotTrainedError(ValueError):
 
 
 class StageModule(pl.LightningModule):
-    """A stage of training that steps its optimiser itself, once the last chunk of a batch is in.
+    """Base of all stages: steps the optimiser itself, once all chunks of the images of an update are in.
 
     Whatever asks to stop (``EarlyStopping``, a ``Timer``, ``max_time``, a callback of yours that sets
     ``trainer.should_stop``) is heard at the end of the pass, so that no update is cut in two. The stage is then

@@ -1,4 +1,4 @@
-"""What the stages do not go together with in a trainer: refused by name before anything trains."""
+"""Refuses, before anything trains, the settings and callbacks of a trainer that would break a stage."""
 
 from typing import Any
 
@@ -60,7 +60,7 @@ def precision_of(value: Any) -> str:
     name = _SPELLINGS.get(str(value), str(value))
     short = name in ("16", "bf16")
     meaning = f"{name} is Lightning's short form of {name}-mixed: write {name}-true." if short else ""
-    allowed = "32-true, 64-true, 16-true or bf16-true: the stages step by themselves, and mix none"
+    allowed = "32-true, 64-true, 16-true or bf16-true: one dtype for all that a stage computes"
     require(name in PRECISIONS, "trainer.precision", value, allowed, meaning)
     return name
 

@@ -1,4 +1,4 @@
-"""Arrays in, pictures out."""
+"""Draw arrays: grids of pictures, histograms, and trajectories of a DMM."""
 
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.plotting.histograms import plot_histograms

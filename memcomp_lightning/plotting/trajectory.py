@@ -1,4 +1,4 @@
-"""The path of a machine through the weight of unsatisfied clauses."""
+"""Plot how the weight of unsatisfied clauses changes while a DMM runs."""
 
 import numpy as np
 from matplotlib.axes import Axes

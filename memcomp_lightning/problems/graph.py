@@ -48,7 +48,10 @@ class Graph(Protocol):
         ...
 
     def alternating(self) -> Tensor:
-        """+1 or -1 for each pair, of shape ``edge_shape``: about as many of each at every variable."""
+        """+1 or -1 for each pair, ``edge_shape``: in which of two ways ``from_qubo`` makes a clause of it.
+
+        Every variable has about as many of each, so that its unit clauses largely cancel.
+        """
         ...
 
     def blocks(self) -> Iterator[slice]:

@@ -217,7 +217,8 @@ def from_qubo(qubo: Qubo) -> WeightedMaxSat:
 def to_qubo(maxsat: WeightedMaxSat) -> Qubo:
     """Return the QUBO whose energy is unsatisfied weight + offset, for every x; inverse of :func:`from_qubo`.
 
-    A literal of polarity q is false as (1 + q) / 2 - q x; a clause costs the product of two of these.
+    (1 + q) / 2 - q x is 1 where a literal of polarity q is false, else 0; a clause costs its weight times the
+    product of two of these.
 
     Raises:
         SettingError: The problem has clauses of three literals or more.

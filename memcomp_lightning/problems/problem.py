@@ -1,4 +1,4 @@
-"""Problems from files."""
+"""Read benchmark problems from files, and score assignments as the files' authors do."""
 
 import difflib
 import math
@@ -30,7 +30,7 @@ class Problem:
         remarks: What a person should know of how the file was read, a sentence each.
         integers: ``problem`` as integers, for solvers that prove; None where int64 does not hold its sums, or for
             clauses of three literals and more.
-        resolved: Whether energies that differ do so in float64.
+        resolved: Whether float64 tells apart all energies that differ.
     """
 
     problem: Qubo | WeightedMaxSat
@@ -79,12 +79,12 @@ class Problem:
 
 
 def read_problem(path: str | Path, format: str | None = None, *, maximise: bool = False) -> Problem:
-    """Read a benchmark problem, packed with gzip, xz or bzip2 or not.
+    """Read a benchmark problem from a file, plain or packed with gzip, xz or bzip2.
 
     Args:
         path: The file.
-        format: A key of :data:`FORMATS`; None is told by the file's name, of ``.txt`` and no suffix by its
-            first lines.
+        format: A key of :data:`FORMATS`; None goes by the file's suffix, or by its first lines where there is
+            none or it is ``.txt``.
         maximise: Whether the file's objective is to be maximised: files of the formats ``beasley``, ``coo``,
             ``qbsolv`` and ``mtx`` come in both kinds, and do not say which. The energy to minimise is then minus
             the objective.

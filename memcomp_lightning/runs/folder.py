@@ -61,7 +61,7 @@ class RunFolder:
 
     @property
     def typed_in(self) -> Path:
-        """Where that command was typed: its relative paths are meant from there."""
+        """The folder in which the run was started: relative paths in its overrides start there."""
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
@@ -133,7 +133,7 @@ class RunFolder:
                 )
 
     def _same_path(self, name: str, there: Any, now: Any) -> bool:
-        """Whether a path of then, meant from where it was typed, is one of now."""
+        """Whether two values mean the same path: the old one from where it was typed, the new one from here."""
         paths = is_path(name) and isinstance(there, str) and isinstance(now, str)
         return paths and self.typed_in / there == Path.cwd() / now
 

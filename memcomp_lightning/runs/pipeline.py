@@ -116,7 +116,7 @@ def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:
 
 
 def _check_trained(stage: Stage) -> None:
-    """Whatever stopped the stage, each of its models has been trained."""
+    """Raise unless each model of the stage has been trained, whatever stopped the stage."""
     passes, module = stage.module.passes, stage.module
     if len(passes) < module.n_models or min(passes) == 0:
         raise UserError(

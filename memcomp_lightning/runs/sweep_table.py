@@ -18,7 +18,7 @@ from memcomp_lightning.runs.table import (
 
 
 def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, Any]]], path: Path) -> str:
-    """A row for each setting, for the screen; the same as CSV in a file.
+    """Write the results of a sweep as CSV, and return them as a table for the screen: a row for each setting.
 
     Mean and standard error are over seeds and replicas. Settings that all runs share are left out.
 

@@ -31,7 +31,7 @@ def with_error(values: Sequence[float], digits: int = 4) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as columns: the first one is the header, numbers to the right."""
+    """The rows as text in columns that are aligned to the right; the first row is the header."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows

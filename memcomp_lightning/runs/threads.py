@@ -15,8 +15,8 @@ WORTH_THREADS = 2**22
 def threads_for(stage: Stage) -> Iterator[None]:
     """Compute small updates in one thread, as fast as in several.
 
-    Others would wait for work by spinning, which makes two runs side by side ten times slower. A number in
-    ``OMP_NUM_THREADS`` stands.
+    More threads would wait for work by spinning, which makes two runs side by side ten times slower. If
+    ``OMP_NUM_THREADS`` is set, nothing is changed.
     """
     n_products = stage.data.n_at_once * max(parameter.numel() for parameter in stage.module.parameters())
     alone = "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS

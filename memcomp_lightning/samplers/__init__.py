@@ -1,4 +1,4 @@
-"""Samplers of the negative phase: one file each, one protocol."""
+"""Samplers of the negative phase: they supply states that stand for the model's own distribution."""
 
 from memcomp_lightning.optional import on_demand
 from memcomp_lightning.samplers.base import NegativePhaseSampler, positive_phase, tensors_of, with_tensors

@@ -15,10 +15,10 @@ from memcomp_lightning.solvers.dimod import check_parameters, problem_at, reads_
 from memcomp_lightning.types import Configurations, NegativePhase
 
 SMALLEST_BETA = 0.01
-"""Estimates stay above it, so that the energies that an annealer is given stay finite."""
+"""Lower bound of an estimated beta: an annealer is given E / beta, which must stay finite."""
 
 MAX_NEWTON_STEPS = 60
-"""Of an estimate; six or so are made."""
+"""Most Newton steps of an estimate, which takes about six."""
 
 
 class AnnealerState(NamedTuple):
@@ -29,12 +29,12 @@ class AnnealerState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AnnealerSamples:
-    r"""The reads of a ``dimod.Sampler`` as the negative phase, at a known effective temperature.
+    r"""Takes the states that a ``dimod.Sampler`` returns (its reads) as the negative phase.
 
     An annealer that is given energies H returns states with about ``exp(-beta H)``; to sample ``exp(-E)`` it is
-    given ``E / beta`` (Adachi & Henderson 2015; Benedetti et al. 2016). ``beta`` is what is known of it, or
-    "estimate": the value of largest pseudo-likelihood of the reads, :func:`maximum_pseudo_likelihood_beta`,
-    followed from update to update, beginning with 1.
+    given ``E / beta`` (Adachi & Henderson 2015; Benedetti et al. 2016). ``beta`` is a number that is known, or
+    "estimate": then it begins with 1 and follows, from update to update, the value under which the reads are
+    likeliest, :func:`maximum_pseudo_likelihood_beta`.
 
     Attributes:
         sampler: The sampler.

@@ -1,4 +1,4 @@
-"""What a sampler of the negative phase is."""
+"""What a sampler of the negative phase must offer, and helpers for its state."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol, TypeVar

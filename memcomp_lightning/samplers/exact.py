@@ -13,9 +13,10 @@ from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Exact:
-    """Every state of the smaller layer with its probability, and the conditional means of the other layer.
+    """The exact negative phase, for models that are small enough to be enumerated.
 
-    The mean energy over these configurations is the exact expectation, because E is linear in each layer. In a
+    It takes every state of the smaller layer with its probability, and the conditional means of the other layer.
+    Their mean energy is the exact expectation, because E is linear in each layer. In a
     model of any connectivity the class with most units takes its means; the states of all others are enumerated.
 
     Attributes:

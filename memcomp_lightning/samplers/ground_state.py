@@ -16,7 +16,9 @@ from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundState:
-    """One QUBO an update; its solution stands for the expectation (Manukian et al. 2019, section 3.2).
+    """Takes the state of lowest energy as the negative phase (Manukian et al. 2019, section 3.2).
+
+    Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model.
 
     Attributes:
         solver: Finds low energies of the QUBO.

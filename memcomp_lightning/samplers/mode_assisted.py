@@ -17,7 +17,7 @@ from memcomp_lightning.types import Configurations, NegativePhase
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ModeSchedule:
-    r"""Probability of the mode in update t of N: ``p_max \sigma(steepness t / N - delay)``.
+    r"""How often the mode is taken: in update t of N with probability ``p_max \sigma(steepness t / N - delay)``.
 
     Manukian, Pei, Bearden and Di Ventra 2020 (Commun. Phys. 3:105), with the values of its public codes: next to
     none in the first quarter, half of ``p_max`` at 30 % of the training, all of it in the second half.
@@ -25,8 +25,8 @@ class ModeSchedule:
     Attributes:
         n_updates: N, updates of the training, >= 1; later ones keep the last probability.
         p_max: Highest probability, in [0, 1].
-        steepness: Of the rise.
-        delay: Of the rise.
+        steepness: How fast the probability rises.
+        delay: How late it rises: it is half of ``p_max`` at t / N = delay / steepness.
     """
 
     n_updates: int
@@ -58,14 +58,15 @@ class ModeAssistedState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ModeAssisted:
-    r"""With the probability of ``schedule`` an update follows ``g (E(data) - E(x*))``, otherwise ``inner``.
+    r"""The negative phase of another sampler, corrected in some updates by the ground state.
 
+    With the probability of ``schedule`` an update follows ``g (E(data) - E(x*))``, otherwise ``inner``.
     x* is the ground state that ``mode`` finds, and
 
     .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
 
-    with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state in units
-    of the largest that couplings of one can give. In a model of any connectivity the number of couplings and
+    with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state as a share
+    of the largest for couplings of size one. In a model of any connectivity the number of couplings and
     biases, plus one, stands for :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM. The scaled
     update is written as a negative phase: x* has the weight g, the positive phase keeps 1 - g. One coin serves all
     replicas, so that a ground state is computed only when it is used. The coin is tossed and counted once a call:
@@ -74,7 +75,7 @@ class ModeAssisted:
     Attributes:
         inner: Sampler of the other updates.
         mode: Sampler of the ground state.
-        schedule: When.
+        schedule: How often updates take the ground state.
     """
 
     uses_data: ClassVar[bool] = True

@@ -13,7 +13,7 @@ from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Quench:
-    """The cheapest annealing there is: it matched a quantum annealer (Job & Adachi, arXiv 2009.00134).
+    """Two sweeps from random states, which matched a quantum annealer (Job & Adachi, arXiv 2009.00134).
 
     Attributes:
         beta_hot: Inverse temperature of the first sweep, in [0, 1].

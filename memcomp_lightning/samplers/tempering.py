@@ -35,21 +35,22 @@ class Ladder(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ParallelTempering:
-    """Persistent chains at inverse temperatures 1 = beta_0 > ... > beta_{T-1} >= 0; the coldest are returned.
+    """Persistent chains that mix better than those of PCD, because they exchange states with hotter chains.
 
+    Inverse temperatures are 1 = beta_0 > ... > beta_{T-1} >= 0; the coldest chains are returned.
     After each sweep neighbours exchange their states with probability
     ``min(1, exp((beta_i - beta_j) (E_i - E_j)))``, even and odd pairs in turn, which leaves the product of all
     ``exp(-beta E) / Z(beta)`` invariant (Desjardins et al. 2010; Cho et al. 2010). The gaps between the
     temperatures follow the accepted share of exchanges towards ``target_swap_rate``; the hottest temperature is
-    where that leads, at most infinite.
+    not set but follows from the gaps, and is at most infinite.
 
     Attributes:
         k: Sweeps an update, >= 1.
         n_chains: Ladders a replica, >= 1; None takes as many as there are images in the batch.
         n_temperatures: Steps of a ladder, >= 2.
         target_swap_rate: Accepted share of exchanges that the gaps are led to, in (0, 1).
-        adaptation: How fast: change of the log of a gap for an accepted share off by one, >= 0; 0 keeps the gaps
-            equal.
+        adaptation: How fast gaps follow: log gap changes by this times (accepted share - target), >= 0; 0 keeps
+            the gaps equal.
     """
 
     uses_data: ClassVar[bool] = False

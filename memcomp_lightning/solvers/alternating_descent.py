@@ -14,12 +14,12 @@ from memcomp_lightning.solvers.base import QuboSolution, Status
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class AlternatingDescent:
-    """Set one block to its optimum given the rest, block after block, until nothing changes.
+    """Find local minima: set block after block to its optimum given the rest, until nothing changes.
 
     In an RBM the blocks are the two layers; elsewhere they are single variables. The energy never rises.
 
     Attributes:
-        n_restarts: Random starts a problem, >= 1.
+        n_restarts: Random starts for each problem, >= 1.
         max_sweeps: Sweeps over all blocks after which a start is given up, >= 1.
     """
 

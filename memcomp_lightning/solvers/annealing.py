@@ -15,17 +15,17 @@ from memcomp_lightning.solvers.base import QuboSolution, Status
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GibbsAnnealing:
-    r"""Block-Gibbs sampling at a rising inverse temperature, then descent.
+    r"""Solve QUBOs by simulated annealing: block-Gibbs sweeps at a rising inverse temperature, then descent.
 
     The blocks of an RBM are its layers. Inverse temperatures are geometric from ``beta_first / s`` to
-    ``beta_last / s`` with the scale of the problem ``s = \sqrt{mean_i \sum_j (Q_ij / 4)^2}``, the couplings of
-    spins; 1 where nothing is coupled.
+    ``beta_last / s``. The scale of the problem is ``s = \sqrt{mean_i \sum_j (Q_ij / 4)^2}`` with the couplings
+    Q_ij / 4 of the spin form; 1 where nothing is coupled.
 
     Attributes:
-        n_restarts: Random starts a problem, >= 1.
+        n_restarts: Random starts for each problem, >= 1.
         n_sweeps: Sweeps over all blocks, >= 1.
-        beta_first: Of the first sweep, > 0.
-        beta_last: Of the last sweep, >= beta_first.
+        beta_first: Inverse temperature of the first sweep in units of 1 / s, > 0.
+        beta_last: Inverse temperature of the last sweep in units of 1 / s, >= beta_first.
     """
 
     n_restarts: int = 28

@@ -25,11 +25,13 @@ class Answer:
     """A solver's answer in the terms of the problem's file, counted without rounding.
 
     Attributes:
-        assignment: The best one, of all variables of the file, ``(n,)`` bool. Feasibility ranks before cost.
+        assignment: The one of lowest energy, with a value for every variable of the file, ``(n,)`` bool.
         score: Its score.
-        energy: Its energy: the score's value, or minus it, and the penalty of unsatisfied hard clauses.
-        energies: Of each restart; None where it was not run.
-        status: Of each restart. OPTIMAL is left where it is proven and no hard clause is unsatisfied.
+        energy: Its energy: the score's value, or minus it if that is maximised, plus the penalty of each
+            unsatisfied hard clause.
+        energies: Energy of each restart; None where it was not run.
+        status: How each restart ended. A proven minimum that leaves a hard clause unsatisfied is INFEASIBLE, one
+            that rests on rounded sums ROUNDED.
     """
 
     assignment: Tensor

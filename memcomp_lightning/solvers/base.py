@@ -28,13 +28,13 @@ class Status(IntEnum):
 
 
 _ADVICE = {
-    Status.OPTIMAL: "Every state was examined: this is the minimum.",
+    Status.OPTIMAL: "Proven: no state has a lower energy.",
     Status.CONVERGED: "No block of variables improves this assignment; more restarts may find a lower one.",
     Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
     Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
     Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
     Status.INFEASIBLE: "Every state was examined: none satisfies all hard clauses; this one breaks the fewest.",
-    Status.ROUNDED: "Every state was examined, but float64 rounds sums of these numbers: another may be lower.",
+    Status.ROUNDED: "The search was complete, but float64 rounds sums of these numbers: another may be lower.",
     Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
 }
 
@@ -46,7 +46,7 @@ class Trajectory(NamedTuple):
         time: Machine time of each record, ``(*problems, n_restarts, n_records)``.
         unsatisfied_weight: Total weight of unsatisfied clauses then, same shape.
         assignments: The digital state then, ``(*problems, n_restarts, n_records, n)``, bool.
-        dwell: Machine time that the record stands for, ``(*problems, n_restarts, n_records)``.
+        dwell: Machine time since the record before, its weight in a time average, same shape as ``time``.
     """
 
     time: Tensor
@@ -55,7 +55,7 @@ class Trajectory(NamedTuple):
     dwell: Tensor
 
     def low_energy_dwell(self) -> Tensor:
-        """``dwell`` of the low-energy stretch of each restart: 0 before its weight first falls to its median."""
+        """Weights for a time average without the start: ``dwell``, but 0 until the weight falls to its median."""
         weight = self.unsatisfied_weight
         reached = (weight <= weight.median(-1, keepdim=True).values).cummax(-1).values
         return self.dwell * reached

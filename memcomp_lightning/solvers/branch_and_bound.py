@@ -17,14 +17,16 @@ from memcomp_lightning.solvers.base import QuboSolution, Status
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BranchAndBound:
-    r"""Search the states of the smaller layer; the other layer follows. Needs numba.
+    r"""Prove the minimum of two fully coupled layers that are too large for ``BruteForce``. Needs numba.
 
-    With the fields f of the larger layer the energy is concave in the smaller one: own + \sum_k min(0, f_k). Over
-    the range that the units not yet set leave to f_k, the chord of min(0, f_k) lies below it and is linear in
-    them, so its minimum is a bound. Trained 32x32 RBMs take milliseconds, mean-cancelled ones seconds.
+    The units of the smaller layer are set one by one; each unit of the larger one then takes its best value. With
+    the fields f of the larger layer the energy is concave in the smaller one: own + \sum_k min(0, f_k). The units
+    not yet set leave f_k a range. On it the chord of min(0, f_k) lies below the function and is linear in these
+    units, so its minimum is a bound. Trained 32x32 RBMs take milliseconds, random ones whose biases cancel the
+    mean field seconds.
 
     Attributes:
-        max_nodes: States of a part of the layer to look at before a problem is given up, >= 1.
+        max_nodes: Partial states to look at before a problem is given up, >= 1; its best state is still returned.
     """
 
     max_nodes: int = 10**9
@@ -33,11 +35,11 @@ class BranchAndBound:
         require_count("max_nodes", self.max_nodes)
 
     def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
-        """Return one assignment a problem, with the status OPTIMAL where it is proven, to the rounding of float64.
+        """Return one assignment for each problem, OPTIMAL where it is proven up to the rounding of float64.
 
-        Of integers whose sums float64 holds the proof is exact; where it rounds them the status is ROUNDED.
+        For integers whose sums float64 holds, the proof is exact; where it rounds the sums, the status is ROUNDED.
 
-        The generator starts a descent, whose energy saves most of the work.
+        The generator draws the starts of a descent: with its energy the search can skip most states.
 
         Raises:
             SettingError: The problem is not of two fully coupled layers.
@@ -88,8 +90,8 @@ class BranchAndBound:
 def _margin(*numbers: NDArray[np.float64]) -> tuple[float, Status]:
     """How far below the known energy a state must lie to be new, and the status of a search that came to its end.
 
-    Half of the smallest difference between sums of integers, which proves exactly; of other numbers the error of a
-    sum in float64, so that states of equal energy are not searched again and again.
+    For integers it is half of the smallest difference between their sums, which makes the proof exact; for other
+    numbers it is the error of a sum in float64, so that states of equal energy are not searched again and again.
     """
     size = float(sum(np.abs(part).sum() for part in numbers))
     error = size * sum(part.size for part in numbers) * float(np.finfo(np.float64).eps)

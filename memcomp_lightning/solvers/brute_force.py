@@ -19,7 +19,10 @@ _NUMBERS = 2**22
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BruteForce:
-    """Try every state; of a bipartite problem every state of the smaller layer, the other one follows.
+    """Prove the minimum of a small problem by trying every state.
+
+    Of two fully coupled layers only the smaller one is enumerated, as its state fixes the best state of the other;
+    problems in int64 are always enumerated whole.
 
     Attributes:
         max_variables: Largest number of variables to enumerate; 2^max_variables states are examined.
@@ -36,7 +39,8 @@ class BruteForce:
     def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
         """Return the minimum as a single restart; the generator is not used.
 
-        A problem in int64 is compared in int64. Its status is ROUNDED where float64 rounds sums of integers.
+        Energies of an int64 problem are compared as integers. Of other problems the status is ROUNDED where the
+        numbers are integers whose sums float64 rounds.
 
         Raises:
             SettingError: More variables to enumerate than ``max_variables``.

@@ -1,4 +1,4 @@
-"""Samplers of dimod as solvers: of dwave-samplers, a quantum annealer behind its composites, hybrid ones."""
+"""Use any sampler of dimod as a solver: simulated annealing, a quantum annealer, D-Wave's hybrid service."""
 
 import time
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from memcomp_lightning.solvers.base import QuboSolution, Status
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DimodSolver:
-    """Any ``dimod.Sampler`` as a :class:`QuboSolver`: of dwave-samplers, a QPU behind its composites, LeapHybrid.
+    """Solve QUBOs with a ``dimod.Sampler``: one of dwave-samplers, a QPU within its composites, or LeapHybrid.
 
     Problems are solved one after the other. A sampler with a ``seed`` parameter gets one from the random stream.
 

@@ -1,4 +1,4 @@
-"""A problem of a file handed to a solver: in the form that it takes, within the memory that there is."""
+"""Hand a problem from a file to a solver in the form that it takes, and refuse what memory cannot hold."""
 
 import math
 import os
@@ -32,12 +32,12 @@ def minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
 
 
 def as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
-    """What every solver takes; the machine takes clauses as they are."""
+    """The problem as a QUBO, which every solver takes; DmmSolver takes clauses as they are."""
     return problem if isinstance(problem, Qubo) else to_qubo(problem)
 
 
 def check_memory(problem: Problem, solver: QuboSolver) -> None:
-    """Refuse what no memory holds: a recorded trajectory, or the states of all restarts."""
+    """Refuse, before anything is solved, a trajectory or states of restarts that memory could not hold."""
     given = problem.problem
     if isinstance(solver, DmmSolver) and solver.record is not None:
         n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
@@ -46,7 +46,7 @@ def check_memory(problem: Problem, solver: QuboSolver) -> None:
             "solver.record.every",
             solver.record.every,
             f"at least {1 + n_bytes // MOST_RECORDED}, for a trajectory of at most {MOST_RECORDED // 2**30} GiB",
-            "solver=dmm records nothing.",
+            "To record nothing, use solver=dmm.",
         )
     if memory_needed(given, solver) > _installed():
         raise UserError(_too_large(problem, solver))

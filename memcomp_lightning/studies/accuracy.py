@@ -33,8 +33,8 @@ class AccuracyTrial:
         build: Makes the objects of a run from its settings; a function of a module, which processes can import.
         iterations: Of pretraining.
         seed: Of weights, chains and order.
-        value: Of the setting that is being chosen, or has been.
-        choosing: Whether it is trained for the choice; it is judged on held-out training images.
+        value: Of the setting that held-out images choose; None where nothing is chosen.
+        choosing: Whether the trial only serves the choice: held-out training images then judge it.
     """
 
     method: str

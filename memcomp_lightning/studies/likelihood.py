@@ -39,7 +39,7 @@ class LikelihoodTrial:
         settings: Of a single run, as plain values.
         build: Makes the objects of a run from its settings; a function of a module, which processes can import.
         n_reported: Seeds 0 to n - 1, side by side.
-        n_choosing: Further seeds, scored on images that the reported ones do not see where there are such.
+        n_choosing: Further seeds that choose the learning rate; likelihoods score them by held-out images.
         points: Passes after which the RBMs are measured.
         measure: A key of ``MEASURES``.
         gradient_draws: Draws of the negative phase whose mean gradient is compared with the exact one.
@@ -82,8 +82,8 @@ class LikelihoodTrial:
     def run(self, progress: Progress) -> list[Record]:
         """Train the replicas side by side and measure them; measurements do not count as time.
 
-        On one thread, and seconds are those of the processor: methods are compared by them while others run
-        beside.
+        It runs on one thread and counts seconds of the processor, so that methods can be compared by time while
+        other trials run beside.
         """
         with in_one_thread():
             return self._run(progress)

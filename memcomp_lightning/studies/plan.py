@@ -48,7 +48,7 @@ class Plan:
     stage_for: Callable[[Any], PretrainingStage] | None = None
 
     def change_between_stages(self, seed: int) -> None:
-        """Do to the pretrained network what is done before it is fine-tuned; the same each time."""
+        """Apply ``between`` to a pretrained DBN before it is fine-tuned; the same seed does the same."""
         if self.between is not None and isinstance(self.network, DBN):
             self.between(self.network, generator=rng.stream(seed, "between stages"))
 

@@ -45,7 +45,7 @@ Do = Callable[[Sequence[Work]], Iterator[list[Record]]]
 
 @contextmanager
 def runner(name: str, *, workers: int | None = 1, accelerator: str = "cpu") -> Iterator[Run]:
-    """What trains a study: this process, or several others.
+    """Yield a function that trains the trials of a study, in this process or in several others.
 
     Args:
         name: Of the study, for the progress bar.
@@ -119,7 +119,7 @@ def _begin_worker(address: Any, key: bytes) -> None:
 
 
 def _end_with(first: Connection) -> None:
-    """A first process that is killed cannot end the others; it says nothing while it lives."""
+    """End this worker when the connection ends: a first process that is killed cannot end its workers."""
     with suppress(EOFError, OSError):
         first.recv()
     os._exit(1)

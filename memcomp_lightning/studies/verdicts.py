@@ -13,8 +13,8 @@ HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
 RULE = (
     "A claim holds if the paired difference is positive with p < .05 (two-sided t test over partitions and "
     "seeds). It holds only without a control if that control accounts for more than half of the gain: the upper "
-    "end of the 95 % interval of the better curve less the control lies below half of it. Fewer iterations are "
-    "judged where the other method gains by its own (p < .05)."
+    "end of the 95 % interval of the better curve less the control lies below half of it. A claim of fewer "
+    "iterations holds only if the other method itself gains by more of them (p < .05)."
 )
 
 
@@ -48,9 +48,9 @@ def verdicts(results: Results) -> list[Verdict]:
 
 
 def horizontal_arrow(results: Results, claim: Claim, passes: int) -> tuple[int, int] | None:
-    """Pretraining iterations of the better curve for what the other one reaches at its last N, and that N.
+    """The least N at which the better curve reaches the other one's accuracy at its last N, and that last N.
 
-    None if it never gets there.
+    None if it never reaches it.
     """
     last = results.lengths(claim.than)[-1]
     goal = results.point(claim.than, last, passes).mean

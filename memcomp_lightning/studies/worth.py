@@ -18,7 +18,7 @@ from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
 
 @dataclass(frozen=True, kw_only=True)
 class DataSet:
-    """What methods are compared on; what it leaves open the comparison says.
+    """A data set that methods are compared on; what is None here, the :class:`Comparison` says.
 
     Attributes:
         label: For people.

@@ -203,7 +203,8 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
         if finds_optimum:
             tolerance = 1e-6 * exact.abs()
             _check(bool((solution.best_energy <= exact + tolerance).all()), f"{where}: minimum not found")
-        _check(solution.status.shape == shape and solution.steps.shape == shape, f"{where}: status or steps")
+        same = solution.status.shape == shape and solution.steps.shape == shape
+        _check(same, f"{where}: status or steps of another shape than energies")
 
 
 def _check(condition: bool, message: str) -> None:

@@ -1,4 +1,4 @@
-"""What an update of a model is, what a stage is made of, and the loops that need no trainer."""
+"""How models are trained: updates, stages and schedules, and loops that need no Lightning trainer."""
 
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import BestPass

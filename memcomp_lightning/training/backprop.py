@@ -1,4 +1,4 @@
-"""The gradient of the mean loss of a batch, by the shortest way.
+"""The gradient of a classifier's loss, in closed form where that is faster than autograd.
 
 Autograd spends more time on its graph than on the numbers of a 32-32-32-10 network: networks of affine layers
 with sigmoid units, or with batch normalisation and ReLU, get their gradient in closed form, the same to rounding,
@@ -120,7 +120,7 @@ def _layers_of(network: nn.Module) -> list[_Layer] | None:
     layers: list[_Layer] = []
     for module in _flat(network):
         if not module.training or module._forward_hooks or module._forward_pre_hooks:
-            return None  # what looks at a module's output, or has frozen its statistics, sees autograd's way
+            return None  # hooks, and statistics frozen by eval(), need the module's own forward pass
         if type(module) is RBM:
             layers.append(_Layer(module.weight, module.c, "sigmoid"))
         elif type(module) is Linear:

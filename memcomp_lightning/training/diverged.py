@@ -1,4 +1,4 @@
-"""Training that left the finite numbers."""
+"""Notice training that has diverged: parameters that are infinite, NaN or huge."""
 
 from torch import nn
 

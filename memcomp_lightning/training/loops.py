@@ -1,9 +1,9 @@
-"""The bare loops: pretraining and fine-tuning of any replicas, without a trainer.
+"""Pretrain and fine-tune any number of replicas without a Lightning trainer, which slows small networks down.
 
 They do what ``EnergyPretraining`` and ``Classifier`` do under a Lightning trainer, update for update and, on the
 CPU, draw for draw: a replica here ends with the weights of the run that trains it alone. On another device chains
-are drawn there, from a stream of that device, and nothing waits for it within a pass. What they leave out looks at
-training, which costs more than an update of a small network.
+are drawn there, from a stream of that device, and nothing waits for it within a pass. Callbacks and
+logs are left out, because they cost more than an update of a small network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -98,7 +98,7 @@ def pretrain(
 
 
 class PhaseTraining:
-    """One model that follows the contrast: its optimiser, its chains and its centres, kept from pass to pass.
+    """Trains one energy model pass by pass, and keeps its optimiser, its chains and its centres in between.
 
     Can be pickled where the phase can.
 
@@ -169,7 +169,7 @@ class PhaseTraining:
 
 
 class ClassifierTraining:
-    """A network that follows the gradient of its loss: its optimiser, kept from pass to pass.
+    """Trains one network pass by pass, and keeps its optimiser in between.
 
     Args:
         network: Maps inputs ``(*replicas, n, n_visible)`` to logits; trained in place.

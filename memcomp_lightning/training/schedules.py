@@ -27,7 +27,7 @@ class Schedule(Protocol):
     """Changes an optimiser at the start of each pass."""
 
     def check(self, optimizer: Optimizer) -> None:
-        """Refuse an optimiser that cannot be changed so.
+        """Refuse an optimiser without the settings that this schedule changes.
 
         Raises:
             SettingError: Naming the optimiser.
@@ -35,7 +35,7 @@ class Schedule(Protocol):
         ...
 
     def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
-        """Set what a pass needs, by its number from 0 within the stage or, in greedy pretraining, the layer."""
+        """Change the optimiser for a pass, numbered from 0 in the stage or, in greedy pretraining, the layer."""
         ...
 
 

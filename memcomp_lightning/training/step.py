@@ -25,7 +25,7 @@ class Processes(Protocol):
 
 
 class OneProcess:
-    """There are no others."""
+    """Training in a single process: nothing to average or to hand on."""
 
     def mean(self, value: Tensor) -> Tensor:
         """The value itself."""
@@ -59,7 +59,7 @@ class StepState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class EnergyStep:
-    r"""The contrast that an update follows, ``mean E(positive) - mean E(negative)``, batch by batch.
+    r"""Computes the loss of an update, ``mean E(positive) - mean E(negative)``, batch by batch.
 
     The images of an update may come in several batches. The first one moves the offsets; one negative phase serves
     all of them, unless the sampler starts at the data.

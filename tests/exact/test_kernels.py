@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import re
 import time
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +20,8 @@ from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.solvers import Status
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
 from memcomp_lightning.solvers.dmm.kernels import common, cpu, lanes, prepare, reference, rows
+from memcomp_lightning.solvers.dmm.kernels import digital as digital_state
+from memcomp_lightning.solvers.dmm.kernels import fields as compiled_fields
 from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
 from memcomp_lightning.solvers.kernels import branch_and_bound
 
@@ -520,7 +524,9 @@ def test_best_is_said_to_come_when_it_was_first_met(name, quench_every):
 def test_local_fields_and_energies_follow_the_flips(name):
     problem = EVERY[name]
     n_problems, n = problem.offset.shape[0], problem.n
-    sparse = cpu._sparse(ClauseField().build(problem), problem, n_problems)
+    sparse = cpu._sparse(
+        compiled_fields.FIELDS[ClauseField].listed(ClauseField().build(problem)), problem, n_problems
+    )
     generator = rng.stream(5, "flips")
     x0 = (rng.uniform((n,), generator=generator) < 0.5).float()
     for p in range(n_problems):
@@ -529,7 +535,7 @@ def test_local_fields_and_energies_follow_the_flips(name):
         digital = (*parts, sparse.variables, sparse.longer_polarity, weight[p])
         x, local = x0.numpy().copy(), np.empty(n, np.float32)
         true = np.zeros(sparse.longer_weight.shape[1], np.int32)
-        first = energy = lanes.local_fields(digital, sparse.linear[p], sparse.pairs, x, local, true)
+        first = energy = digital_state.local_fields_listed(digital, sparse.linear[p], sparse.pairs, x, local, true)
         unit = scale_of(problem, p) / scale_of_arrays(sparse, p)
 
         def check(energy, x=x, local=local, first=first, unit=unit, p=p):
@@ -543,11 +549,11 @@ def test_local_fields_and_energies_follow_the_flips(name):
         check(energy)
         for _ in range(60):
             i, before = int(torch.randint(n, (), generator=generator)), x.copy()
-            energy += lanes.flip(digital, x, local, true, i)
+            energy += digital_state.flip_listed(digital, x, local, true, i)
             assert np.argwhere(x != before).tolist() == [[i]]
             check(energy)
         fresh, fresh_true = np.empty_like(local), np.empty_like(true)
-        again = lanes.local_fields(digital, sparse.linear[p], sparse.pairs, x, fresh, fresh_true)
+        again = digital_state.local_fields_listed(digital, sparse.linear[p], sparse.pairs, x, fresh, fresh_true)
         np.testing.assert_allclose(fresh, local, atol=1e-5)
         assert again == pytest.approx(energy, abs=1e-5)
         np.testing.assert_array_equal(fresh_true, true)
@@ -625,6 +631,24 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"lanes.gone.nbi", "lanes.new.nbi"}
 
 
+# --- a field of another package -----------------------------------------------------------------------------
+
+
+def test_passes_of_the_page_take_the_same_steps():
+    """The example of docs/extending.md: one row of the table, and the kernel integrates its field."""
+    page = (Path(__file__).parents[2] / "docs/extending.md").read_text(encoding="utf-8")
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "class Gradient" in b]
+    made = {}
+    exec(compile(block, "extending.md", "exec"), made)
+    try:
+        field = made["fast"].field
+        for name in ("listed", "bipartite 17 + 11"):
+            begin = start(PROBLEMS[name], 17, field)
+            alike(PROBLEMS[name], *both(field, PROBLEMS[name], begin, n_steps=20, quench_every=3))
+    finally:
+        del compiled_fields.FIELDS[made["Gradient"]]
+
+
 # --- the same code in every process ------------------------------------------------------------------------
 
 
@@ -637,7 +661,7 @@ def test_constants_have_the_names_of_their_places():
         assert [getattr(common, name.upper()) for name in names] == list(range(len(names)))
 
 
-COMPILED = [common, rows, lanes, prepare, branch_and_bound, likelihood_kernel]
+COMPILED = [common, digital_state, rows, lanes, prepare, branch_and_bound, likelihood_kernel]
 
 
 @pytest.mark.parametrize("module", COMPILED, ids=lambda module: module.__name__)

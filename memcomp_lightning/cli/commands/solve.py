@@ -87,7 +87,7 @@ def _bits(x: Tensor) -> str:
 
 
 def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> None:
-    """Solution and picture; then the table, and where they are. What cannot be written is printed all the more."""
+    """Write solution and picture, then print table and paths; the table is printed even if writing fails."""
     solver = OmegaConf.to_container(config.solver, resolve=True)
     assert isinstance(solver, dict)
     settings: dict[str, Any] = {str(name): value for name, value in solver.items()}

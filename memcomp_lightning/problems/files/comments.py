@@ -26,7 +26,7 @@ _MEANING = re.compile(
 
 
 def unread(lines: list[str], counted: tuple[str, ...] = ()) -> list[str]:
-    """A remark on each comment that seems to change what the numbers mean, but on names that are counted."""
+    """A remark on each comment that seems to change what the numbers mean; names in ``counted`` get none."""
     if not holds(lines, "=:"):
         return []
     return [

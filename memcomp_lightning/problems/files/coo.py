@@ -16,8 +16,8 @@ _OTHER = re.compile(r"[\"']?\b([A-Za-z_][\w-]*)[\"']?\s*[:=]\s*([^\s,;}]+)", re.
 def parse(source: Source, maximise: bool) -> Parsed:
     """``i j bias`` with x in {0, 1}, or s = 2 x - 1 in {-1, 1}; i = j is linear.
 
-    dimod writes what x is into a comment and leaves the constant of a model out; ``# offset=3`` gives one. Spins
-    give one of their own when s becomes x: with it the energy is that of the file for every state.
+    dimod writes into a comment whether the file has x or s, and leaves out a model's constant; ``# offset=3``
+    gives one. Writing s in terms of x adds another: with it the energy of every state is that of the file.
     """
     lines = source.lines()
     vartype = said(source, lines, _VARTYPE, _NAMES_VARTYPE, _TYPES)

@@ -16,9 +16,9 @@ class Format(NamedTuple):
 
     Attributes:
         parse: From the file, and whether its objective is to be maximised, to a problem to minimise.
-        suffixes: File names that tell it.
-        layout: For a person.
-        either_way: Whether the authors of such files minimise or maximise, as they like.
+        suffixes: Suffixes of such files.
+        layout: What such a file looks like, for messages.
+        either_way: Whether some files of this format are to be minimised and others to be maximised.
     """
 
     parse: Callable[[Source, bool], Parsed]
@@ -77,7 +77,7 @@ def guess(source: Source) -> str | None:
 
 
 def _may_be_header(lines: list[str], first: list[str]) -> bool:
-    """Whether three numbers may be the header of what follows: it has so many lines, or none counts from 0."""
+    """Whether three numbers may be a header: the second counts the lines that follow, or no index is 0."""
     rows = [line.partition("#")[0].split() for _, line in filled(lines)]
     from_zero = any("0" in row[:2] for row in rows)
     return not from_zero or (first[1] == str(len(rows) - 1) and first[0] != "0")

@@ -18,11 +18,11 @@ Exact = int | Fraction
 LARGEST_INT64 = 2**63 - 1
 
 MOST_DIGITS = 1000
-"""Of a number in a file. float64 has 308 before the point; Python converts no more than 4300."""
+"""Most digits of a number in a file. float64 reaches 1e308; Python converts no more than 4300 digits."""
 
 
 def fits(word: str) -> bool:
-    """Whether float64 can hold the size of a number: neither infinite nor, unless it is 0, nothing at all."""
+    """Whether a word is a number that float64 can hold: it neither overflows nor, unless it is 0, becomes 0."""
     if len(word) > MOST_DIGITS or NUMBER.fullmatch(word) is None:
         return False
     size = abs(float(word))

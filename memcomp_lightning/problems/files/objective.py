@@ -1,4 +1,4 @@
-"""What the authors of a file count, counted exactly, and the problem to minimise that goes with it."""
+"""Turn a file's entries into a problem to minimise, and count an answer exactly as the file's authors do."""
 
 import math
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class Objective:
     Attributes:
         name: Such as "cut weight".
         counting: How it is counted, over the problem's variables.
-        maximised: Whether more is better; the energy of the problem always falls.
+        maximised: Whether more is better; the energy to minimise is then minus the value.
         penalty: What an unsatisfied hard clause adds to the energy, more than all soft ones together.
     """
 
@@ -144,7 +144,7 @@ def from_terms(
     terms = Terms(terms.kind, i, j, numbers)
     size = 9 * numbers.total  # a pair of spins: 4 x_i x_j - 2 x_i - 2 x_j + 1
     integers = None
-    if numbers.integers.dtype != object:  # energies fit: what passes 2^63 on the way comes back by as much
+    if numbers.integers.dtype != object:  # energies fit: sums on the way that overflow wrap round, and back again
         integers = _as_qubo(terms, len(used), torch.from_numpy(sign * numbers.integers))
     _check_size(source, numbers.exact(size))
     if integers is None or size > LARGEST_INT64 or numbers.decimals > 22:  # 10^22 is the last that float64 holds
@@ -204,7 +204,7 @@ _LARGEST_SUM = 10**307
 
 
 def _resolved(size: int, decimals: int, n_terms: int) -> bool:
-    """Whether sums in float64 of numbers of this size together tell apart what differs by one unit."""
+    """Whether sums in float64 tell apart what differs by one unit; ``size`` bounds the sums, in units."""
     return size <= 2**53 if decimals == 0 else size * (n_terms + 2) <= 2**51
 
 
@@ -266,7 +266,7 @@ def from_clauses(
     hard: list[bool],
     remarks: Sequence[str] = (),
 ) -> Parsed:
-    """Hard clauses weigh more than all soft ones together: breaking one never pays."""
+    """The MAX-SAT problem of a file's clauses; a hard one weighs more than all soft ones together."""
     lengths = [len(clause) for clause in clauses]
     flat = np.array([literal for clause in clauses for literal in clause], np.int64)
     used, position = np.unique(np.abs(flat), return_inverse=True)
@@ -292,10 +292,10 @@ def from_clauses(
 
 
 def _penalty(total: int, one: int) -> int:
-    """Of a hard clause: more than the soft ones together by 1, by a thousandth of them if that is more.
+    """Weight of a hard clause: that of all soft ones together, plus 1 or a 1024th of it if that is more.
 
-    The compiled kernels read states out in float32, which a smaller margin would escape. Soft clauses of less than
-    1 together are outweighed twice, as a 1 would drown them.
+    The compiled kernels rank states in float32, where a smaller margin would be rounded off. Soft clauses of less
+    than 1 together are outweighed by twice their weight: next to a margin of 1 they could be rounded off.
     """
     margin = min(one, total) or one
     return total + max(margin, -(-total // 1024))

@@ -1,4 +1,4 @@
-"""What a sampler of the positive phase is."""
+"""What a sampler of the positive phase must offer; models need one if their hidden units are coupled."""
 
 from typing import NamedTuple, Protocol
 

@@ -16,11 +16,11 @@ from memcomp_lightning.types import Configurations
 class MeanField:
     """Factorised p(h | v), by :func:`memcomp_lightning.models.mean_field`.
 
-    Its bound on the likelihood is what is followed then. ``info`` says how many of the replicas converged
+    Training then follows a lower bound of the likelihood. ``info`` says for each replica whether it converged
     ("mean_field_converged"), the last change of a mean and the iterations.
 
     Attributes:
-        max_iterations: >= 1; where it does not converge until then, the last means are used.
+        max_iterations: >= 1; without convergence by then, the last means are used.
         tolerance: Largest change of a mean that counts as converged, > 0.
     """
 

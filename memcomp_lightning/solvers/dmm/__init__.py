@@ -1,4 +1,4 @@
-"""Digital memcomputing machines: vector fields, integrators, kernels and the solver."""
+"""Digital memcomputing machines (DMMs), which solve QUBO and MAX-SAT by integrating an ODE with memories."""
 
 from memcomp_lightning.solvers.dmm.base import Recording, VectorField
 from memcomp_lightning.solvers.dmm.bond import BondField

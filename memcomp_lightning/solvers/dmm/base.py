@@ -1,4 +1,4 @@
-"""What a memory dynamics is: a problem in its units, a state, the time derivative, the bounds."""
+"""The contract of the DMM's equations: what a class must offer so that ``DmmSolver`` can integrate it."""
 
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
@@ -24,10 +24,10 @@ class HasVoltage(Protocol):
 
 
 class VectorField(Protocol[MachineT, StateT]):
-    """One family of memory dynamics. Pure: settings are frozen, the state goes in and comes out.
+    """One set of equations of the DMM, as pure functions: settings are frozen, states are taken and returned.
 
-    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple of tensors,
-    of which those named ``...long_term`` outlive a warm restart and have their rest value at 1.
+    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple of tensors.
+    Those whose names end in ``long_term`` are kept over a warm restart and are 1 at rest.
     """
 
     @property
@@ -50,11 +50,11 @@ class VectorField(Protocol[MachineT, StateT]):
         ...
 
     def stability(self, machine: MachineT) -> Tensor:
-        """Factor in (0, 1] on the largest change of a voltage in a step, ``(*problems, 1)``."""
+        """Factor > 0 on ``StepControl.change``, so that steps suit the problem's size, ``(*problems, 1)``."""
         ...
 
     def init(self, machine: MachineT, voltage: Tensor) -> StateT:
-        """The memories that belong to initial voltages ``(*problems, n_restarts, n)``."""
+        """The state at the start: voltages ``(*problems, n_restarts, n)`` as given, and their memories."""
         ...
 
     def derivative(self, machine: MachineT, state: StateT) -> StateT:
@@ -70,7 +70,7 @@ class Recording(NamedTuple):
     """What to keep of a trajectory.
 
     Attributes:
-        every: Record each so many steps, >= 1.
+        every: Steps from one record to the next, >= 1.
     """
 
     every: int = 8

@@ -48,7 +48,7 @@ class BondState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class BondField:
-    r"""The vector field of the bond dynamics.
+    r"""Equations of the DMM for spins, an alternative to ``ClauseField``: every coupling has two memories.
 
     Spins relaxed to voltages v in [-1, 1]; a coupling J of the energy ``-\sum J v_i v_j - \sum h_i v_i`` is a
     bond, a field h_i is a bond to a spin clamped at +1. With C = 1 + kappa sign(J) v_i v_j:
@@ -62,8 +62,8 @@ class BondField:
     :func:`~memcomp_lightning.solvers.dmm.scaling.coupling_norm`, or by half their largest eigenvalue if that
     is more.
 
-    Deviations from [P]: a bond pulls its spins to 0 in proportion to its strength (there, all bonds alike),
-    which makes the machine the same with or without bonds of strength 0; satisfaction counts by its sign.
+    Deviations from [P]: a bond pulls its spins to 0 in proportion to its strength, where in [P] all bonds pull
+    alike, so that bonds of strength 0 change nothing; C depends on the sign of J, not on its size.
 
     Attributes:
         alpha: Strength of the drive, > 0.

@@ -1,7 +1,7 @@
 """Clause dynamics: every clause of a weighted MAX-SAT has a short- and a long-term memory.
 
-Sources: [B] Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), the 3-SAT form, eqs. 2 to 6. Its weighted
-two-literal form as in public research code of the same group. Constants: docs/dmm.md.
+Sources: [B] Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), the 3-SAT form, eqs. 2 to 6. The weighted
+two-literal form follows public research code of the same group. Constants: docs/dmm.md.
 """
 
 import math
@@ -60,7 +60,7 @@ class ClauseState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ClauseField:
-    r"""The vector field of the clause dynamics.
+    r"""Equations of the default DMM: clauses with memories push the voltages until they are satisfied.
 
     With literal polarity q, voltage v in [-1, 1], clause weight w, the falsehood f_i = 1/2 (1 - q_i v_i) of a
     literal and the clause's unsatisfaction ``C = min_i f_i``:

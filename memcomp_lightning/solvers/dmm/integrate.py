@@ -63,10 +63,11 @@ class Integrator(Protocol):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StepControl:
-    r"""``dt = clip(s change / \sqrt{mean_i (dv_i/dt)^2}, dt_min, dt_max)``, for each restart on its own.
+    r"""Choose the step size of each restart: shorter steps where its voltages change faster.
 
-    The factor s is the field's ``stability`` on the problem. The steps are far too large for an accurate
-    trajectory; what matters is that the machine keeps its attractors.
+    ``dt = clip(s change / \sqrt{mean_i (dv_i/dt)^2}, dt_min, dt_max)``, s being the field's ``stability`` on the
+    problem. The steps are far too large for an accurate trajectory; what matters is that the machine keeps its
+    attractors.
 
     Deviation from Bearden, Pei, Di Ventra, Sci. Rep. 10:19741 (2020), methods, who bound the largest
     \|dv_i/dt\|: the largest of n numbers grows with n and with a few strong fields, their mean square does not.
@@ -115,10 +116,11 @@ class Splitting(StepControl):
     r"""Lie splitting: the voltages move with frozen memories, then the memories with the new voltages.
 
     The voltages move by ``dt [(1 - lag) f_k + lag f_{k-1}]``, where f_k is dv/dt at step k: a linear two-step
-    method. Couplings that are strong for the step make voltages jump back and forth, with f changing its sign from
-    step to step; this mode is multiplied by 1 - 2 lag, slow ones stay as they are. 0 is Euler's rule.
+    method. Where a coupling is too strong for the step, voltages jump back and forth and f changes its sign from
+    step to step. The lag multiplies such motion by 1 - 2 lag and leaves slow motion as it is; lag = 0 is Euler's
+    rule.
 
-    The compiled kernels need a single pass over the memories for it, which makes it the fastest scheme.
+    It is the only scheme with compiled kernels, which need a single pass over the memories for a step.
 
     Attributes:
         lag: Share of the last step's rate, in [0, 1/2].

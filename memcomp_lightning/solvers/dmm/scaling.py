@@ -1,4 +1,4 @@
-"""The rule that carries one set of constants from 32 to 100,000 variables."""
+"""Bring all problems to one scale, so that the same constants suit 32 and 100,000 variables."""
 
 import math
 
@@ -26,11 +26,11 @@ def by_largest(coupling: Tensor, linear: Tensor, n_axes: int) -> tuple[Tensor, T
 
 
 def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
-    r"""Root mean square over the coupled variables of ``\sqrt{\sum_j w_ij^2}``, ``(*problems,)``.
+    r"""The scale to divide couplings by, so that rates are of order 1, ``(*problems,)``.
 
-    A random assignment drives a variable with about this strength, whatever the size and the degree: divided by
-    it, couplings give rates of order 1. Zero couplings and isolated variables do not change it. 1 where
-    nothing is coupled.
+    Root mean square over the coupled variables of ``\sqrt{\sum_j w_ij^2}``: a random assignment drives a variable
+    with about this strength, whatever the size and the degree. Zero couplings and isolated variables do not change
+    it. 1 where nothing is coupled.
     """
     power = coupling.square()
     per_variable = graph.scatter(power, power)
@@ -39,9 +39,10 @@ def coupling_norm(graph: Graph, coupling: Tensor) -> Tensor:
 
 
 def effective_degree(size: Tensor, power: Tensor) -> Tensor:
-    r"""Mean over the coupled variables of ``(\sum_j |w_ij|)^2 / \sum_j w_ij^2``, ``(*problems,)``.
+    r"""Number of couplings that matter to a variable, which bounds the long-term memories, ``(*problems,)``.
 
-    The number of couplings of a variable if all are alike, fewer if some are stronger. At least 1.
+    Mean over the coupled variables of ``(\sum_j |w_ij|)^2 / \sum_j w_ij^2``: the number of couplings of a variable
+    if all are alike, less if some are stronger. At least 1.
 
     Args:
         size: ``\sum_j |w_ij|`` of each variable, ``(*problems, n)``.
@@ -57,10 +58,10 @@ DEGREE_EXPONENT = 0.17
 
 
 def step_scale(n: int, n_coupled: Tensor) -> Tensor:
-    r"""Factor ``(n_c / 200)^{-0.3} \sqrt{n_c / n}`` on a step that suits 200 variables, ``(*problems,)``.
+    r"""Factor on a step that suits 200 variables: larger problems want smaller steps (measured), ``(*problems,)``.
 
-    Larger problems want smaller steps (measured); the root takes off what variables without couplings add to the
-    number of variables in a root mean square.
+    It is ``(n_c / 200)^{-0.3} \sqrt{n_c / n}``. The root corrects for variables without couplings, which count in
+    the root mean square of the rates, too.
 
     Args:
         n: Number of variables.
@@ -75,11 +76,12 @@ SIZE_EXPONENT = 0.3
 
 
 def collective_mode(graph: Graph, coupling: Tensor) -> Tensor:
-    r"""``min(1, 2 / \lambda)`` with the largest \|eigenvalue\| of couplings of norm 1, ``(*problems,)``.
+    r"""Factor on couplings of norm 1 that keeps all variables from flipping together, ``(*problems,)``.
 
-    Independent couplings have lambda of about 2. Where all variables pull alike, as in MAX-CUT of an unweighted
-    graph, lambda is larger, and steps that suit independent couplings would let all variables flip back and forth
-    together: the critical step falls with 1 / lambda. Found by power iteration from a fixed start, which is
+    It is ``min(1, 2 / \lambda)``, lambda being the largest \|eigenvalue\| of the couplings: about 2 if they are
+    independent. Where all variables pull alike, as in MAX-CUT of an unweighted graph, lambda is larger, and steps
+    that suit independent couplings would let all variables flip back and forth together: the critical step falls
+    with 1 / lambda. Found by power iteration from a fixed start, which is
     orthogonal to no pattern that problems are likely to have.
 
     Args:
@@ -110,9 +112,9 @@ def mean_strength(graph: Graph, coupling: Tensor) -> Tensor:
 
 
 def decisive(graph: Graph, coupling: Tensor, linear: Tensor) -> Tensor:
-    r"""Limit \|linear_i\| to twice ``\sum_j |w_ij|``, at least 1, which decides a variable as surely.
+    r"""Limit \|linear_i\| to what surely decides variable i: twice ``\sum_j |w_ij|``, at least 1.
 
-    Unlimited, one huge field would set the step size of a whole machine.
+    Without the limit one huge field would set the step size of the whole machine.
     """
     size = coupling.abs()
     limit = (2 * graph.scatter(size, size)).clamp(min=1)

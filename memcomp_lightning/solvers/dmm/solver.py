@@ -20,7 +20,6 @@ from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status, Trajectory
 from memcomp_lightning.solvers.dmm.base import Recording, VectorField
-from memcomp_lightning.solvers.dmm.bond import BondField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.kernels import reference
@@ -31,11 +30,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class WarmRestart:
-    """A restart that goes on from where the last one of its row ended.
+    """Let a group of restarts go on from where the group before it ended, instead of from random voltages.
 
     Attributes:
         keep: Share of the long-term memory that is kept, in [0, 1].
-        spread: Width of the uniform kick on the final voltages, in (0, 2]; 2 forgets them.
+        spread: Bound of the uniform kick on the final voltages, in (0, 2].
     """
 
     keep: float = 0.5
@@ -48,11 +47,11 @@ class WarmRestart:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DmmSolver:
-    """Integrate a memory dynamics from random initial conditions and keep the best assignment met.
+    """Solve QUBO and weighted MAX-SAT by integrating a DMM, and keep the best assignment met.
 
     QUBO -> weighted MAX-SAT -> ODE -> assignment (Manukian et al. 2019, Fig. 3). Restarts run side by side,
-    ``patience`` of them at a time; the rule is the paper's, checked after each such group: stop once
-    ``patience`` restarts have passed without a better assignment.
+    ``patience`` of them at a time. After each such group the paper's rule is checked: stop once ``patience``
+    restarts have passed without a better assignment.
 
     Attributes:
         field: The vector field.
@@ -61,10 +60,11 @@ class DmmSolver:
         patience: Restarts without a better assignment after which a problem is done, 1 to n_restarts; None
             runs all restarts at once.
         max_steps: Most integration steps a restart, >= 1; None takes :func:`default_steps` of the problem.
-        stall: A restart ends early once it has done :func:`default_min_steps` and this many steps more for each
-            that its best assignment took, > 0; None lets all run for ``max_steps``. Recorded ones always do.
-        quench_every: Each so many steps the digital state is read, and a copy of it descends by single flips;
-            the machine does not feel it. 0 reads at every step, without a descent. None takes
+        stall: Factor > 0: a restart whose best assignment came at step k ends early, after
+            :func:`default_min_steps` plus ``stall`` times k steps. With None, and while recording, every restart
+            runs for ``max_steps``.
+        quench_every: Steps from one reading of the bits to the next. A copy of the bits then descends by single
+            flips, without any effect on the machine. 0 reads at every step, without a descent. None takes
             :func:`default_quench` of the problem.
         warm: How later groups begin; None draws new voltages with memories at rest.
         record: Records trajectories, for the time average and for plots; None does not.
@@ -112,8 +112,8 @@ class DmmSolver:
                 self.patience is not None and self.n_restarts % self.patience == 0,
                 "warm",
                 self.warm,
-                f"used with a patience that divides n_restarts = {self.n_restarts}",
-                f"Set patience (now {self.patience}): so many restarts run at a time, later ones go on from them.",
+                f"null, or a patience that divides n_restarts = {self.n_restarts}",
+                f"Set patience (now {self.patience}), the number of restarts that each later group goes on from.",
             )
         if self.record is not None:
             require_parts("record", self.record, "Recording", ("every",))
@@ -227,17 +227,19 @@ class DmmSolver:
     def _obstacle(self, device: str) -> str | None:
         """Why the compiled kernel cannot run, and what to do; None if it can."""
         integrator = self.integrator or self.field.integrator
-        if type(self.field) not in (ClauseField, BondField):
-            return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
-        if isinstance(self.field, ClauseField) and self.field.zeta > 0:
-            return f"zeta = {self.field.zeta:g} has no compiled kernel: set it to 0 for speed."
-        if type(integrator) is not Splitting:
-            return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
         if device != "cpu":
             return f"The problem is on {device}: the plain torch kernel runs there."
         if importlib.util.find_spec("numba") is None:
             return "numba is not installed: the plain torch kernel is many times slower. pip install numba"
-        return _import_failure()
+        if (failure := _import_failure()) is not None:
+            return failure
+        from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS
+
+        if type(self.field) not in FIELDS:
+            return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
+        if type(integrator) is not Splitting:
+            return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
+        return FIELDS[type(self.field)].obstacle(self.field)
 
 
 class _Part(NamedTuple):
@@ -251,19 +253,20 @@ class _Part(NamedTuple):
 
 
 def default_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Most steps a restart: three for each variable up to 200, then by the rule ``600 (n / 200)^(1/4)``."""
+    """Default of ``max_steps``: 3 n up to n = 200 variables, then ``600 (n / 200)^(1/4)``; at least 50."""
     return max(50, round(min(3 * problem.n, 600 * math.pow(problem.n / 200, 0.25))))
 
 
 def default_min_steps(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps that each restart gets before it may stall: a fifteenth of the most."""
+    """Steps that each restart gets before it may stall: a fifteenth of :func:`default_steps`, at least 10."""
     return max(10, default_steps(problem) // 15)
 
 
 def default_quench(problem: Qubo | WeightedMaxSat) -> int:
-    """Steps between two readings: 1 for two coupled layers, else by the rule ``6 n / n_pairs``, at least 2.
+    """Default of ``quench_every``: 1 for two fully coupled layers, else ``6 n / n_pairs``, at least 2.
 
-    A step costs as much as the pairs, a descent as much as the variables and its flips.
+    The cost of a step grows with the pairs, that of a descent with the variables: where pairs are few, so are
+    readings.
     """
     if isinstance(problem.graph, Bipartite):
         return 1
@@ -310,7 +313,7 @@ def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> 
 
 
 def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
-    """Two layers of which few variables are coupled, as a list of the couplings that are there."""
+    """Turn two layers with few non-zero couplings into a list of pairs, which is faster to integrate."""
     if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
         return problem
     if problem.coupling.count_nonzero() > _SPARSE * problem.coupling.numel():

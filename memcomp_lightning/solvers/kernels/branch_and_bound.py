@@ -12,7 +12,7 @@ announce_compilation()
 
 @njit(fastmath=True, cache=True, nogil=True)
 def search(weight: Any, linear: Any, other: Any, best: float, max_nodes: int) -> Any:
-    """Search depth first; unit d is at 0, then at 1, then free again.
+    """Find the lowest energy by a depth-first search: unit d is set to 0, then to 1, then left free again.
 
     Args:
         weight: ``(n, m)``, couplings of the n units that are searched to the m that follow.

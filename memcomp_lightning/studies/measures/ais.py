@@ -15,7 +15,7 @@ FANTASY_SWEEPS = 200
 
 
 def scoring(data: ImageDataModule, n_reported: int) -> Scoring:
-    """AIS reports too small a partition function and reverse AIS too large a one: they bracket the score."""
+    """Score by AIS, whose log Z tends to be too small, and by reverse AIS, whose log Z tends to be too large."""
     negative, v = negative_log_likelihood(data, n_reported), data.images.train_v
     base, annealing = base_of(v), Ais()
 

@@ -34,8 +34,9 @@ def without_diverged(model: EnergyModel) -> tuple[EnergyModel, Tensor]:
 def gradient_bias(model: EnergyModel, sampler: Any, done: Pass, n_draws: int) -> tuple[Tensor, Tensor]:
     """Cosine and relative error of a sampler's mean gradient against the exact one, ``(*replicas,)`` each.
 
-    Of the mean over some draws from the sampler's present state: noise of the draws is small in it, that of where
-    persistent chains are is not. NaN where the model is too large, and where one of its layers is in training.
+    The mean is over ``n_draws`` draws from the sampler's present state: that averages out the noise of draws, but
+    not that of where persistent chains happen to be. NaN where the model is too large to enumerate, and while a
+    single layer of it is in training.
     """
     exact, generator = Exact(max_units=MAX_UNITS), rng.stream(done.number, "gradient bias")
     sizes = (done.positive.v.shape[-1], done.positive.h.shape[-1])
@@ -53,7 +54,7 @@ def gradient_bias(model: EnergyModel, sampler: Any, done: Pass, n_draws: int) ->
 def mean_gradient(
     model: EnergyModel, sampler: Any, state: Any, positive: Configurations, n_draws: int, *, generator: Generator
 ) -> Tensor:
-    """The mean over draws from one state; the coin of mode assistance is not tossed, both sides are weighed."""
+    """The mean gradient over draws from one state; mode assistance counts both of its updates by probability."""
 
     def drawn(sample: Any, state: Any) -> Tensor:
         return gradient(

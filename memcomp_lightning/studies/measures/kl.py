@@ -1,4 +1,4 @@
-"""Divergence of the data set from the model, where the data set is all that there is to know."""
+"""KL divergence of the data from the model, for data sets that are their whole distribution."""
 
 from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.likelihood import kl_divergence

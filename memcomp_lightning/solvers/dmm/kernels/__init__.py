@@ -1,1 +1,1 @@
-"""Kernels: programs that integrate a vector field, one file a device or compiler."""
+"""Kernels: loops over the steps of a DMM, in plain torch (``reference``) or compiled for the CPU (``cpu``)."""

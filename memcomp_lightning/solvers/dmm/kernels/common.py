@@ -37,17 +37,11 @@ LAG: Final = 4
 CONTROL: Final = ("change", "dt_min", "dt_max", "noise", "lag")
 """What stands in a problem's row of step control."""
 
-REFRESH: Final = 64
-"""Local fields are summed from scratch each so many readings, which bounds their rounding error."""
-
-MAX_SWEEPS: Final = 1000
-"""Ends a quench that rounding errors would keep alternating between equal energies."""
-
 TINY: Final = np.float32(1e-30)
 """In place of a rate of 0, which asks for the longest step."""
 
 FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp", "nnan", "ninf"}
-"""Sums may be reordered, which vector code needs; NaN and infinity keep their meaning."""
+"""Sums may be reordered, which vector code needs; nothing may be NaN or infinite (nnan, ninf)."""
 
 
 @njit(nogil=True, cache=True, inline="always")
@@ -97,20 +91,3 @@ def clause(weight, voltage, false_second, short, long, rates):
     first = weight * (gradient * false_second + at_first)
     second = abs(weight) * (gradient * false_first + (rigidity - at_first))
     return short, long, first, second
-
-
-@njit(nogil=True, cache=True, forceinline=True)
-def keep_if_new(x, best):
-    """Copy a state; return whether it differs."""
-    new = False
-    for i in range(x.size):
-        new |= best[i] != x[i]
-        best[i] = x[i]
-    return new
-
-
-@njit(nogil=True, cache=True, forceinline=True)
-def copy(source, target):
-    """Copy numbers one by one: an assignment of slices takes seconds to compile, for the words of its error."""
-    for i in range(source.size):
-        target[i] = source[i]

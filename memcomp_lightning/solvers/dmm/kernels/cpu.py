@@ -1,6 +1,7 @@
 """The compiled kernels: hand tensors to numba and share the restarts among threads."""
 
 import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import cache
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 from memcomp_lightning.compiling import announce_compilation
@@ -17,24 +19,23 @@ from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.dmm.base import Recording
-from memcomp_lightning.solvers.dmm.bond import BondField, BondMachine
-from memcomp_lightning.solvers.dmm.clause import ClauseField, ClauseMachine
+from memcomp_lightning.solvers.dmm.bond import BondField
+from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Splitting
-from memcomp_lightning.solvers.dmm.kernels import common, lanes, rows
+from memcomp_lightning.solvers.dmm.kernels import common, digital, lanes, rows
 from memcomp_lightning.solvers.dmm.kernels.common import BOND
+from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS, Listed
 from memcomp_lightning.solvers.dmm.kernels.prepare import prepare
 from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start, Visited
 
 announce_compilation()
 
 Array = np.ndarray[Any, Any]
-Field = ClauseField | BondField
-Machine = ClauseMachine | BondMachine
 Steps = tuple[int, int, int, int, float]
 
 
 def run(
-    field: Field,
+    field: Any,
     integrator: Splitting,
     problem: Qubo | WeightedMaxSat,
     start: Start,
@@ -49,13 +50,14 @@ def run(
     every = recording.every if recording is not None else 0
     min_steps, factor = (n_steps, 0.0) if stall is None or every else stall
     steps = (n_steps, quench_every, every, min_steps, float(factor))
-    if isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
+    in_rows = isinstance(field, ClauseField | BondField)
+    if in_rows and isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
         return _run_rows(field, integrator, problem, problem.graph, start, steps, remember)
     return _run_lanes(field, integrator, problem, start, steps)
 
 
 def _run_rows(
-    field: Field,
+    field: Any,
     integrator: Splitting,
     problem: Qubo,
     graph: Bipartite,
@@ -67,7 +69,12 @@ def _run_rows(
     n_problems, n_restarts, n = start.voltage.shape
     padded = _prepared(field, problem, graph)
     width, height, n_first, n_second = padded.sizes
-    constants, control = _settings(field, integrator, *padded.scalars.T)
+    stability, pull_scale, degree = padded.scalars.T
+    of_problem = {"pull_scale": pull_scale}
+    if isinstance(field, ClauseField):
+        of_problem = {"long_term_max": field.most_long_term(degree)}
+    constants = _constants(field, common.CONSTANTS, n_problems, of_problem)
+    control = _control(field, integrator, stability)
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
     control[:, common.CHANGE] *= np.sqrt(n / (width + height))
     voltage = _pad(_array(start.voltage), n_first, width, width + height)
@@ -117,7 +124,7 @@ class _Prepared(NamedTuple):
     linear: Array
 
 
-def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
+def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
     """Scale problems into the machine's units and into those of the digital state; pad the layers."""
     n_problems, n_first, n_second = problem.offset.shape[0], graph.n_first, graph.n_second
     width, height = (-(-n // _VECTOR) * _VECTOR for n in (n_first, n_second))
@@ -136,17 +143,15 @@ def _prepared(field: Field, problem: Qubo, graph: Bipartite) -> _Prepared:
 
 
 def _run_lanes(
-    field: Field, integrator: Splitting, problem: Qubo | WeightedMaxSat, start: Start, steps: Steps
+    field: Any, integrator: Splitting, problem: Qubo | WeightedMaxSat, start: Start, steps: Steps
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
-    machine: Any = field.build(problem)
-    one = torch.ones((), dtype=torch.float32, device="cpu")
-    scalars = (machine.pull_scale, one) if isinstance(machine, BondMachine) else (one, machine.degree)
-    flat = [_array(x).reshape(-1) for x in (field.stability(machine), *scalars)]
-    constants, control = _settings(field, integrator, *flat)
+    passes, machine = FIELDS[type(field)], field.build(problem)
+    constants = _constants(field, passes.constants, len(start.voltage), passes.of_problem(field, machine))
+    control = _control(field, integrator, _array(field.stability(machine)).reshape(-1))
     n_problems, n_restarts, n = start.voltage.shape
     n_blocks, lanes_each = _blocks(n_restarts)
-    sparse = _sparse(machine, problem, n_problems)
+    sparse = _sparse(passes.listed(machine), problem, n_problems)
     voltage = _to_lanes(_array(start.voltage), n_blocks, lanes_each)
     sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
     kept = [_array(memory) for memory in start.kept]
@@ -155,20 +160,27 @@ def _run_lanes(
     seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks, lanes_each)[:, :, 0])
     out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
-    own = (sparse.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
+    own = (passes.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
     arrays = (*own, longer, sparse.digital, sparse.linear)
     state = (voltage, *memories, seed)
     work = (sparse.weight.size + sparse.longer_weight.size) * n_restarts * steps[0]
-    _share(lanes.integrate_all, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
+    ours = type(passes.kind).__module__.startswith("memcomp_lightning.")
+    kernel = lanes.integrate_all if ours else _of_this_process()
+    _share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
     out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
     final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
     return _finish(out, final[0], final[1:], steps)
 
 
+@cache
+def _of_this_process() -> Any:
+    """The kernel for fields of other packages; on disk it would name types that other processes may not find."""
+    return njit(nogil=True)(lanes.integrate_all.py_func)
+
+
 class _Sparse(NamedTuple):
     """A problem as the lanes kernel reads it."""
 
-    kind: int
     pairs: Array
     weight: Array
     polarity: Array
@@ -180,21 +192,18 @@ class _Sparse(NamedTuple):
     linear: Array
 
 
-def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -> _Sparse:
+def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> _Sparse:
     """Flatten a problem and list, for each variable, its pairs and its longer clauses."""
     pairs = np.ascontiguousarray(problem.graph.edges().cpu().numpy())
     n, n_pairs = problem.n, pairs.shape[0]
-    if isinstance(machine, BondMachine):
-        kind, weight, unit = BOND, machine.bond, machine.field
-        polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
-        variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
-        longer_weight = np.zeros((n_problems, 0), np.float32)
-    else:
-        kind, weight, unit = 1 - BOND, machine.weight, machine.unit
-        both = [q.expand(weight.shape).reshape(n_problems, n_pairs) for q in (machine.first, machine.second)]
-        polarity = _array(torch.stack(both, dim=-1))
-        variables, longer_polarity = machine.longer_variables.numpy(), _array(machine.longer_polarity)
-        longer_weight = _array(machine.longer_weight.squeeze(-2))
+    polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
+    if listed.polarity is not None:
+        polarity = _array(listed.polarity)
+    variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
+    longer_weight = np.zeros((n_problems, 0), np.float32)
+    if listed.longer is not None:
+        variables = listed.longer[0].numpy()
+        longer_polarity, longer_weight = (_array(x) for x in listed.longer[1:])
     if isinstance(problem, Qubo):
         quadratic, block_weights = problem, []
     else:
@@ -213,11 +222,10 @@ def _sparse(machine: Machine, problem: Qubo | WeightedMaxSat, n_problems: int) -
     of_pairs = (offsets, neighbours, order % max(n_pairs, 1), coupling)
     of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
     return _Sparse(
-        kind,
         pairs,
-        _array(weight.reshape(n_problems, n_pairs)),
+        _array(listed.weight.reshape(n_problems, n_pairs)),
         polarity,
-        _array(unit.squeeze(-2)),
+        _array(listed.unit.reshape(n_problems, n)),
         variables,
         longer_polarity,
         longer_weight,
@@ -232,20 +240,21 @@ def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
     return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
 
 
-def _settings(
-    field: Field, integrator: Splitting, stability: Array, pull_scale: Array, degree: Array
-) -> tuple[Array, Array]:
-    """Constants of the field and of the steps as the kernels read them, a row a problem."""
-    constants = np.zeros((len(stability), len(common.CONSTANTS)), np.float32)
-    for index, name in enumerate(common.CONSTANTS):
-        constants[:, index] = getattr(field, name, 0.0)
-    constants[:, common.PULL_SCALE] = pull_scale
-    if isinstance(field, ClauseField):
-        constants[:, common.LONG_TERM_MAX] = field.most_long_term(degree)
+def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Mapping[str, Any]) -> Array:
+    """Settings of the field as its passes read them, a row a problem; 0 where the field has none of a name."""
+    constants = np.zeros((n_problems, len(names)), np.float32)
+    for index, name in enumerate(names):
+        value = of_problem[name] if name in of_problem else getattr(field, name, 0.0)
+        constants[:, index] = np.asarray(value).reshape(-1)
+    return constants
+
+
+def _control(field: Any, integrator: Splitting, stability: Array) -> Array:
+    """The step control as the kernels read it, a row a problem."""
     limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
     control = np.tile(np.array(limits, np.float32), (len(stability), 1))
     control[:, common.CHANGE] *= stability
-    return constants, control
+    return control
 
 
 def _digital(*parts: Tensor) -> tuple[Array, ...]:
@@ -328,7 +337,8 @@ def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -
 
     Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
     """
-    _forget_outdated(kernel)
+    if kernel.stats.cache_path is not None:
+        _forget_outdated(kernel)
     stop = np.zeros(1, np.uint8)
     n_threads = min(torch.get_num_threads(), n_items)
     if n_threads <= 1 and work < _SHORT:
@@ -353,13 +363,13 @@ _SHORT = 2e8
 
 @cache
 def _forget_outdated(kernel: Any) -> None:
-    """Remove cached code of the disk that numba would take for new.
+    """Delete compiled code on disk that is older than ``common.py``, whose functions it contains.
 
-    It compiles anew when a function's own file changes, not when what it inlines does.
+    Numba compiles a function anew when its own file changes, but not when that of an inlined function does.
     """
-    folder, module = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
-    inlined = Path(common.__file__).stat().st_mtime
-    for index in folder.glob(f"{module}.*.nbi"):
+    folder, name = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
+    inlined = max(Path(module.__file__).stat().st_mtime for module in (common, digital, lanes))
+    for index in folder.glob(f"{name}.*.nbi"):
         with suppress(FileNotFoundError):  # another process was first
             if index.stat().st_mtime < inlined:
                 index.unlink()

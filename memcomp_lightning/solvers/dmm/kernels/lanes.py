@@ -10,14 +10,15 @@ each: only then does the compiler make vector code of them.
 """
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
+from numba.extending import overload
 
 from memcomp_lightning.solvers.dmm.kernels.common import (
     ALPHA,
     BETA,
-    BOND,
     CHANGE,
     DELTA,
     DT_MAX,
@@ -29,10 +30,8 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     KAPPA,
     LAG,
     LONG_TERM_MAX,
-    MAX_SWEEPS,
     NOISE,
     PULL_SCALE,
-    REFRESH,
     SHORT_TERM_MIN,
     SHORT_TERM_START,
     TINY,
@@ -40,10 +39,20 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     ZETA,
     clause,
     clause_rates,
-    copy,
-    keep_if_new,
     uniform,
 )
+from memcomp_lightning.solvers.dmm.kernels.digital import (
+    REFRESH,
+    copy,
+    keep_better,
+    local_fields_listed,
+    quench_listed,
+    read_out_listed,
+    transpose_signs,
+)
+
+if TYPE_CHECKING:
+    from memcomp_lightning.solvers.dmm.kernels.fields import Compiled
 
 U64 = np.uint64
 
@@ -111,7 +120,10 @@ def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
 def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
-    """The same for clauses of three literals and more, padded with polarity 0; the last arrays are scratch."""
+    """Do what ``clause_pass`` does, for clauses of three literals and more, padded with polarity 0.
+
+    ``falsehood`` and ``scratch`` hold intermediate results.
+    """
     zero, half, one = F32(0), F32(0.5), F32(1)
     alpha, beta, gamma, delta, epsilon = c[ALPHA], c[BETA], c[GAMMA], c[DELTA], c[EPSILON]
     cap = c[LONG_TERM_MAX] - one
@@ -191,105 +203,92 @@ def bond_fields(field, short, long, voltage, rate, c, dt):
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def flip(digital, x, field, true, i):
-    """Flip variable ``i`` of one restart; return the change of energy.
-
-    The digital states lie restart by restart, one number a variable: ``x`` and ``field`` of a restart stay close
-    together. ``true`` counts the true literals of each longer clause.
-    """
-    start, neighbour, edge, coupling, in_clause, clause_of, variables, polarity, weight = digital
+def clause_start(problem, memories, voltage, c):
+    """Short-term memories begin at x_s(0) = C(0): how far each clause is from being satisfied."""
+    _, pairs, _, polarity, _, (variables, longer_polarity, _) = problem
+    memory, _, _, longer_memory = memories
     half, one = F32(0.5), F32(1)
-    change = one - F32(2) * x[i]
-    gain = change * field[i]
-    x[i] += change
-    for at in range(start[i], start[i + 1]):
-        field[neighbour[at]] += change * coupling[edge[at]]
-    for at in range(in_clause[i], in_clause[i + 1]):
-        clause_at = clause_of[at]
-        before = true[clause_at]
-        after = before
-        for j in range(variables.shape[1]):
-            if variables[clause_at, j] == i and polarity[clause_at, j] != 0:
-                after += 1 if (polarity[clause_at, j] > 0) == (x[i] > half) else -1
-        true[clause_at] = after
-        for j in range(variables.shape[1]):
-            other, sign = variables[clause_at, j], polarity[clause_at, j]
-            if sign == 0 or other == i:
-                continue
-            holds = 1 if (sign > 0) == (x[other] > half) else 0
-            # A literal decides its clause where no other one is true.
-            was, now = before == holds, after == holds
-            if was != now:
-                field[other] += (-sign if now else sign) * weight[clause_at]
-    return gain
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
-def local_fields(digital, linear, pairs, x, field, true):
-    """Write the local fields of one restart from scratch; return its energy."""
-    coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
-    half, energy = F32(0.5), 0.0
-    copy(linear, field)
-    for e in range(coupling.size):
-        field[pairs[e, 0]] += coupling[e] * x[pairs[e, 1]]
-        field[pairs[e, 1]] += coupling[e] * x[pairs[e, 0]]
-    for i in range(linear.size):
-        energy += half * x[i] * (linear[i] + field[i])
-    for at in range(weight.size):
-        count = 0
-        for j in range(variables.shape[1]):
-            sign = polarity[at, j]
-            if sign != 0 and (sign > 0) == (x[variables[at, j]] > half):
-                count += 1
-        true[at] = count
-        if count == 0:
-            energy += weight[at]
-        for j in range(variables.shape[1]):
-            sign = polarity[at, j]
-            if sign != 0:
-                holds = 1 if (sign > 0) == (x[variables[at, j]] > half) else 0
-                if count == holds:
-                    field[variables[at, j]] -= sign * weight[at]
-    return energy
+    for e in range(memory.shape[0]):
+        for k in range(voltage.shape[1]):
+            false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
+            false_second = half - half * polarity[e, 1] * voltage[pairs[e, 1], k]
+            memory[e, 0, k] = c[EPSILON] + min(false_first, false_second)
+    for e in range(longer_memory.shape[0]):
+        for k in range(voltage.shape[1]):
+            unsatisfied = one
+            for j in range(variables.shape[1]):
+                sign = longer_polarity[e, j]
+                if sign != 0:
+                    unsatisfied = min(unsatisfied, half - half * sign * voltage[variables[e, j], k])
+            longer_memory[e, 0, k] = c[EPSILON] + unsatisfied
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def quench(digital, x, field, true):
-    """Flip single variables of one restart as long as each flip lowers the energy; return the change."""
-    one, two, total = F32(1), F32(2), 0.0
-    for _ in range(MAX_SWEEPS):
-        # A vector loop finds out whether anything moves; the sweep itself goes one by one.
-        n_eager = 0
-        for i in range(x.size):
-            n_eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
-        if n_eager == 0:
-            break
-        for i in range(x.size):
-            if (one - two * x[i]) * field[i] < 0:
-                total += flip(digital, x, field, true, i)
-    return total
+def clause_advance(problem, memories, voltage, rate, scratch, c, dt):
+    """Clauses of two literals, of one, and of more."""
+    _, pairs, weight, polarity, unit, longer = problem
+    memory, _, unit_long, longer_memory = memories
+    push, falsehood, numbers = scratch
+    clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt)
+    clause_units(unit, unit_long, voltage, rate, c, dt)
+    longer_pass(longer, longer_memory, voltage, rate, falsehood, numbers, c, dt)
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def read_out(digital, signs, x, field, true, found):
-    """Bring one restart up to its voltages' signs; return the change of energy and how many bits changed."""
-    change, n_found = 0.0, U64(0)
-    for i in range(U64(x.size)):
-        found[n_found] = i
-        n_found += U64(1) if signs[i] != x[i] else U64(0)
-    for m in range(n_found):
-        change += flip(digital, x, field, true, found[m])
-    return change, n_found
+def bond_start(problem, memories, voltage, c):
+    """All short-term memories begin at ``short_term_start``."""
+    memory, unit_short, _, _ = memories
+    for e in range(memory.shape[0]):
+        for k in range(voltage.shape[1]):
+            memory[e, 0, k] = c[SHORT_TERM_START]
+    unit_short[:] = c[SHORT_TERM_START]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
-def transpose_signs(voltage, signs):
-    """Write 1 for TRUE and 0 for FALSE, restart by restart, from voltages with the restarts last."""
-    n, lanes = voltage.shape
-    for first in range(0, n, 16):
-        for k in range(lanes):
-            for i in range(first, min(first + 16, n)):
-                signs[k, i] = F32(1) if voltage[i, k] > 0 else F32(0)
+@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+def bond_advance(problem, memories, voltage, rate, scratch, c, dt):
+    """Bonds, then fields."""
+    _, pairs, bond, _, field, _ = problem
+    memory, field_short, field_long, _ = memories
+    bond_pass(pairs, bond, memory, voltage, rate, scratch[0], c, dt)
+    bond_fields(field, field_short, field_long, voltage, rate, c, dt)
+
+
+def start(kind, problem, memories, voltage, c):
+    """What the field of this kind does at the first voltages; see :class:`fields.Compiled`."""
+    return passes_of(type(kind)).start(problem, memories, voltage, c)
+
+
+def advance(kind, problem, memories, voltage, rate, scratch, c, dt):
+    """What the field of this kind does in each step."""
+    return passes_of(type(kind)).advance(problem, memories, voltage, rate, scratch, c, dt)
+
+
+# The type of the kind decides when the kernel is compiled; without numba's compilation, the functions above do.
+@overload(start, jit_options={"forceinline": True, "fastmath": FAST_MATH})
+def _start(kind, problem, memories, voltage, c):
+    chosen = passes_of(kind.instance_class).start
+
+    def call(kind, problem, memories, voltage, c):
+        chosen(problem, memories, voltage, c)
+
+    return call
+
+
+@overload(advance, jit_options={"forceinline": True, "fastmath": FAST_MATH})
+def _advance(kind, problem, memories, voltage, rate, scratch, c, dt):
+    chosen = passes_of(kind.instance_class).advance
+
+    def call(kind, problem, memories, voltage, rate, scratch, c, dt):
+        chosen(problem, memories, voltage, rate, scratch, c, dt)
+
+    return call
+
+
+def passes_of(kind: type) -> "Compiled":
+    """The row of :data:`fields.FIELDS` for a type of kind."""
+    from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS  # which imports the passes above
+
+    return next(row for row in FIELDS.values() if type(row.kind) is kind)
 
 
 @njit(nogil=True, cache=True)
@@ -348,7 +347,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def integrate(problem, digital, linear, c, control, start, steps, stop, best, times, states):
+def integrate(problem, digital, linear, c, control, begin, steps, stop, best, times, states):
     """Integrate the lanes of a block; return the step at which each one's ``best`` was met, and its last step.
 
     Args:
@@ -358,7 +357,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         linear: ``(n,)``, of the energy.
         c: Constants of the field, named in ``common.CONSTANTS``.
         control: Step control, named in ``common.CONTROL``.
-        start: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
+        begin: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
             last, initial values in and final values out; and the seeds of the noise.
         steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
             quench. A restart rests from the first reading at or after step min_steps + stall found_at.
@@ -367,34 +366,27 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
         times: ``(lanes, n_records)``, out.
         states: ``(lanes, n_records, n)``, out.
     """
-    kind, pairs, weight, polarity, unit, longer = problem
-    longer_variables, longer_polarity, longer_weight = longer
-    voltage, long, unit_long, longer_long, seeds = start
+    kind, pairs, weight, _, unit, longer = problem
+    longer_variables, _, longer_weight = longer
+    voltage, long, unit_long, longer_long, seeds = begin
     n_steps, quench_every, every, min_steps, stall = steps
     half, one = F32(0.5), F32(1)
     n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
     rate, push = np.zeros((n, 2, lanes), F32), np.empty(2 * lanes, F32)
     memory, longer_memory = np.empty((n_pairs, 2, lanes), F32), np.empty((n_longer, 2, lanes), F32)
-    unit_short = np.full((n, lanes), c[SHORT_TERM_START], F32)
+    unit_short = np.zeros((n, lanes), F32)
     falsehood = np.empty((longer_variables.shape[1], lanes), F32)
     # Arrays of their own: rows of one array could overlap for all that the compiler knows.
     smallest, next_smallest, at = np.empty(lanes, F32), np.empty(lanes, F32), np.empty(lanes, F32)
-    scratch = (smallest, next_smallest, at, np.empty(lanes, F32), np.empty(lanes, F32))
+    scratch = (push, falsehood, (smallest, next_smallest, at, np.empty(lanes, F32), np.empty(lanes, F32)))
+    memories = (memory, unit_short, unit_long, longer_memory)
     for e in range(n_pairs):
         for k in range(lanes):
-            false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
-            false_second = half - half * polarity[e, 1] * voltage[pairs[e, 1], k]
-            memory[e, 0, k] = c[SHORT_TERM_START] if kind == BOND else c[EPSILON] + min(false_first, false_second)
             memory[e, 1, k] = long[e, k]
     for e in range(n_longer):
         for k in range(lanes):
-            unsatisfied = one
-            for j in range(longer_variables.shape[1]):
-                sign = longer_polarity[e, j]
-                if sign != 0:
-                    unsatisfied = min(unsatisfied, half - half * sign * voltage[longer_variables[e, j], k])
-            longer_memory[e, 0, k] = c[EPSILON] + unsatisfied
             longer_memory[e, 1, k] = longer_long[e, k]
+    start(kind, problem, memories, voltage, c)
     x, field, true = np.empty((lanes, n), F32), np.empty((lanes, n), F32), np.zeros((lanes, n_longer), np.int32)
     tried, tried_field, tried_true = np.empty(n, F32), np.empty(n, F32), np.empty(n_longer, np.int32)
     signs, found = np.empty((lanes, n), F32), np.empty(n + 1, np.uint64)
@@ -404,7 +396,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
     before = np.zeros((n, lanes), F32)
     transpose_signs(voltage, x)
     for k in range(lanes):
-        energy[k] = local_fields(digital, linear, pairs, x[k], field[k], true[k])
+        energy[k] = local_fields_listed(digital, linear, pairs, x[k], field[k], true[k])
     last, n_running = np.full(lanes, n_steps), lanes
     n_reads, counter = 0, U64(0)
     for step in range(n_steps + 1):
@@ -414,28 +406,22 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
             transpose_signs(voltage, signs)
             n_reads += 1
             for k in range(lanes):
-                change, n_changed = read_out(digital, signs[k], x[k], field[k], true[k], found)
+                change, n_changed = read_out_listed(digital, signs[k], x[k], field[k], true[k], found)
                 energy[k] += change
                 changed[k] = changed[k] or n_changed > 0
                 if n_reads % REFRESH == 0:
-                    energy[k] = local_fields(digital, linear, pairs, x[k], field[k], true[k])
+                    energy[k] = local_fields_listed(digital, linear, pairs, x[k], field[k], true[k])
         if reads:
             for k in range(lanes):
                 if not changed[k]:
                     continue
-                if energy[k] < lowest[k]:
-                    lowest[k] = energy[k]
-                    if keep_if_new(x[k], best[k]) or step == 0:
-                        found_at[k] = step
+                lowest[k], found_at[k] = keep_better(energy[k], lowest[k], x[k], best[k], step, found_at[k])
                 if quench_every > 0:
                     copy(x[k], tried)
                     copy(field[k], tried_field)
                     copy(true[k], tried_true)
-                    reached = energy[k] + quench(digital, tried, tried_field, tried_true)
-                    if reached < lowest[k]:
-                        lowest[k] = reached
-                        if keep_if_new(tried, best[k]) or step == 0:
-                            found_at[k] = step
+                    reached = energy[k] + quench_listed(digital, tried, tried_field, tried_true)
+                    lowest[k], found_at[k] = keep_better(reached, lowest[k], tried, best[k], step, found_at[k])
                 changed[k] = False
         if recorded:
             for k in range(lanes):
@@ -444,13 +430,7 @@ def integrate(problem, digital, linear, c, control, start, steps, stop, best, ti
                     states[k, step // every - 1, i] = x[k, i] > half
         # One pass moves the memories by the step that led here and finds the rate of the voltages.
         rate[:] = 0
-        if kind == BOND:
-            bond_pass(pairs, weight, memory, voltage, rate, push, c, dt)
-            bond_fields(unit, unit_short, unit_long, voltage, rate, c, dt)
-        else:
-            clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt)
-            clause_units(unit, unit_long, voltage, rate, c, dt)
-            longer_pass(longer, longer_memory, voltage, rate, falsehood, scratch, c, dt)
+        advance(kind, problem, memories, voltage, rate, scratch, c, dt)
         if reads:
             for k in range(lanes):
                 if last[k] == n_steps and step < n_steps and step >= min_steps + stall * found_at[k]:

@@ -1,7 +1,7 @@
 """Compiled twin of ``ClauseField.build`` and ``BondField.build`` for two fully coupled layers.
 
-A 32x32 problem is solved in the time that a few hundred tensor operations take; the same arithmetic compiled takes
-none to speak of. What the quantities mean stands in ``scaling.py`` and in the fields.
+The tensor operations of ``build`` would take as long as solving a 32x32 problem; compiled, the same arithmetic
+takes next to nothing. ``scaling.py`` and the fields explain the quantities.
 """
 
 import math
@@ -9,7 +9,8 @@ import math
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.solvers.dmm.kernels.common import BOND, F32, copy
+from memcomp_lightning.solvers.dmm.kernels.common import BOND, F32
+from memcomp_lightning.solvers.dmm.kernels.digital import copy
 from memcomp_lightning.solvers.dmm.scaling import POWER_ITERATIONS, SIZE_EXPONENT, SMALLEST_RATIO
 
 
@@ -89,7 +90,7 @@ def _way(i, j, n_second, n_first):
 
 @njit(nogil=True, cache=True, forceinline=True)
 def _unit_clauses(coupling, linear, unit):
-    """The unit clauses of ``qubo.from_qubo``."""
+    """The unit clauses of ``maxsat.from_qubo``."""
     n_second, n_first = coupling.shape
     for i in range(unit.size):
         unit[i] = -linear[i]

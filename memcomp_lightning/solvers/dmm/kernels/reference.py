@@ -102,7 +102,7 @@ def quench(problem: Qubo | WeightedMaxSat, x: Tensor) -> Tensor:
 
 
 def _rounds(like: Tensor) -> int:
-    """Rounds from one look whether all is settled to the next: on a device the host waits for it."""
+    """Rounds between two checks for the end: off the CPU each check makes Python wait for the device."""
     return 1 if like.device.type == "cpu" else 8
 
 

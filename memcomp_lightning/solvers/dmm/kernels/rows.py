@@ -28,10 +28,8 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     KAPPA,
     LAG,
     LONG_TERM_MAX,
-    MAX_SWEEPS,
     NOISE,
     PULL_SCALE,
-    REFRESH,
     SHORT_TERM_MIN,
     SHORT_TERM_START,
     TINY,
@@ -39,9 +37,15 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     ZETA,
     clause,
     clause_rates,
-    copy,
-    keep_if_new,
     uniform,
+)
+from memcomp_lightning.solvers.dmm.kernels.digital import (
+    REFRESH,
+    copy,
+    keep_better,
+    local_fields_matrix,
+    quench_matrix,
+    read_out_matrix,
 )
 
 U64 = np.uint64
@@ -163,91 +167,6 @@ def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def flip(n_first, n_second, coupling, transposed, x, field, i):
-    """Flip one variable; return the change of energy."""
-    change = F32(1) - F32(2) * x[i]
-    gain = change * field[i]
-    x[i] += change
-    if i < n_first:
-        row = i * n_second
-        for j in range(n_second):
-            field[n_first + j] += change * transposed[row + j]
-    else:
-        row = (i - n_first) * n_first
-        for j in range(n_first):
-            field[j] += change * coupling[row + j]
-    return gain
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def local_fields(n_first, n_second, coupling, linear, x, field):
-    """Write the local fields of a digital state from scratch; return its energy."""
-    energy, row = 0.0, U64(0)
-    for j in range(n_first + n_second):
-        field[j] = linear[j]
-        energy += linear[j] * x[j]
-    for i in range(n_second):
-        total, on = F32(0), x[n_first + i]
-        for j in range(n_first):
-            total += coupling[row + j] * x[j]
-            field[j] += coupling[row + j] * on
-        field[n_first + i] += total
-        energy += total * on
-        row += n_first
-    return energy
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def quench(n_first, n_second, coupling, transposed, x, field, found):
-    """Flip single variables, layer by layer, as long as each flip lowers the energy; return the change.
-
-    ``found`` is scratch: the variables of a layer that want to flip. They are not coupled to each other.
-    """
-    total, one, two, n_resting = 0.0, F32(1), F32(2), 0
-    for sweep in range(2 * MAX_SWEEPS):
-        begin, end = (U64(0), n_first) if sweep % 2 == 0 else (n_first, n_first + n_second)
-        n_eager = 0
-        for i in range(begin, end):
-            n_eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
-        n_resting = n_resting + 1 if n_eager == 0 else 0
-        if n_resting == 2:
-            break
-        if n_eager > 0:
-            # Without branches, of which every other one would be a surprise.
-            k = U64(0)
-            for i in range(begin, end):
-                found[k] = i
-                k += U64(1) if (one - two * x[i]) * field[i] < 0 else U64(0)
-            for m in range(k):
-                total += flip(n_first, n_second, coupling, transposed, x, field, found[m])
-    return total
-
-
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def read_out(n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found):
-    """Bring the digital state and its fields up to the voltages; return its energy and how many bits changed."""
-    half, n, n_changed = F32(0.5), n_first + n_second, 0
-    for i in range(n):
-        n_changed += 1 if (voltage[i] > 0) != (x[i] > half) else 0
-    if MANY * n_changed > n:
-        for i in range(n):
-            x[i] = F32(1) if voltage[i] > 0 else F32(0)
-        energy = local_fields(n_first, n_second, coupling, linear, x, field)
-    elif n_changed > 0:
-        k = U64(0)
-        for i in range(n):
-            found[k] = i
-            k += U64(1) if (voltage[i] > 0) != (x[i] > half) else U64(0)
-        for m in range(k):
-            energy += flip(n_first, n_second, coupling, transposed, x, field, found[m])
-    return energy, n_changed
-
-
-MANY = 3
-"""Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
-
-
 @njit(nogil=True, cache=True)
 def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, last, times, states):
     """Integrate the restarts numbered ``begin`` to ``end - 1``, problem by problem.
@@ -261,8 +180,8 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         problem: (kind, sizes, side, constants, weight, unit, coupling, transposed, linear), the last six a problem
             each, matrices flat; sizes are n_first, n_second, and how many of both are no padding.
         control: Step control, named in ``common.CONTROL``, ``(n_problems, 5)``.
-        start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``; without restarts, the
-            memories begin at rest and are not returned.
+        start: (voltage, long, unit_long, seed), each ``(n_problems, n_restarts, ...)``; where ``long`` has size 0
+            in place of n_restarts, memories begin at rest and are not returned.
         steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
         best: Out, ``(n_problems, n_restarts, n)``.
         found_at: Out, the step at which it was met, ``(n_problems, n_restarts)``; 0 for the initial state.
@@ -335,33 +254,29 @@ def integrate(problem, c, control, voltage, long, unit_long, seed, steps, stop, 
     tried, tried_field, found = np.empty(n, F32), np.empty(n, F32), np.empty(n + 1, np.uint64)
     for i in range(n):
         x[i] = one if voltage[i] > 0 else F32(0)
-    energy = local_fields(n_first, n_second, coupling, linear, x, field)
+    energy = local_fields_matrix(n_first, n_second, coupling, linear, x, field)
     lowest, found_at, elapsed = 1e300, 0, 0.0
     dt, changed, n_reads, counter = F32(0), True, 0, U64(0)
     for step in range(n_steps + 1):
         recorded = every > 0 and step > 0 and step % every == 0
         reads = quench_every == 0 or step % quench_every == 0
         if step > 0 and (reads or recorded):
-            energy, n_changed = read_out(
+            energy, n_changed = read_out_matrix(
                 n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found
             )
             changed = changed or n_changed > 0
             n_reads += 1
             if n_reads % REFRESH == 0:
-                energy = local_fields(n_first, n_second, coupling, linear, x, field)
+                energy = local_fields_matrix(n_first, n_second, coupling, linear, x, field)
         if reads and changed:
-            if energy < lowest:
-                lowest = energy
-                if keep_if_new(x, best) or step == 0:
-                    found_at = step
+            lowest, found_at = keep_better(energy, lowest, x, best, step, found_at)
             if quench_every > 0:
                 copy(x, tried)
                 copy(field, tried_field)
-                reached = energy + quench(n_first, n_second, coupling, transposed, tried, tried_field, found)
-                if reached < lowest:
-                    lowest = reached
-                    if keep_if_new(tried, best) or step == 0:
-                        found_at = step
+                reached = energy + quench_matrix(
+                    n_first, n_second, coupling, transposed, tried, tried_field, found
+                )
+                lowest, found_at = keep_better(reached, lowest, tried, best, step, found_at)
             changed = False
         if recorded:
             times[step // every - 1] = elapsed
