@@ -44,6 +44,8 @@ class SaturationGuard(pl.Callback):
         DivergedError: Naming tensor, entry and pass, or the share of stuck means, and the file.
     """
 
+    changes_training = True
+
     def __init__(self, largest: float = 1e4, patience: int = 5) -> None:
         require(largest > 0, "largest", largest, "a number > 0")
         require_count("patience", patience)

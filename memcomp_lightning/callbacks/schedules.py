@@ -19,6 +19,8 @@ class Schedules(pl.Callback):
         SettingError: When training starts: an optimiser that a schedule cannot change.
     """
 
+    changes_training = True
+
     def __init__(self, *schedules: Schedule) -> None:
         self.schedules = schedules
 

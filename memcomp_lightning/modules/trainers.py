@@ -44,7 +44,6 @@ _ONLY_LOOK = (
     callbacks.ProgressBar,
     callbacks.ThroughputMonitor,
 )
-_MAY_END_IT = ("SaturationGuard",)
 _NEED_A_LOGGER = (callbacks.DeviceStatsMonitor, callbacks.LearningRateMonitor, callbacks.ThroughputMonitor)
 
 
@@ -98,9 +97,11 @@ def check_bare_loop(callback: pl.Callback, where: str) -> None:
         SettingError: Naming the callback.
     """
     module, name = type(callback).__module__, type(callback).__name__
-    looks = isinstance(callback, _ONLY_LOOK) or module.startswith("memcomp_lightning.callbacks.")
+    ours = module.startswith("memcomp_lightning.callbacks.")
+    looks = isinstance(callback, _ONLY_LOOK) or not getattr(callback, "changes_training", not ours)
     allowed = "callbacks that only look at training: figures, comparisons and choices train without a trainer"
-    require(looks and name not in _MAY_END_IT, where, name, allowed, "Leave it out.")
+    remedy = "Leave it out, or say changes_training = False in its class if it only looks."
+    require(looks, where, name, allowed, "Leave it out." if ours else remedy)
 
 
 def check_callback(callback: pl.Callback, where: str = "callback") -> None:

@@ -368,7 +368,7 @@ def _forget_outdated(kernel: Any) -> None:
     Numba compiles a function anew when its own file changes, but not when that of an inlined function does.
     """
     folder, name = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
-    inlined = max(Path(module.__file__).stat().st_mtime for module in (common, digital, lanes))
+    inlined = max(Path(str(module.__file__)).stat().st_mtime for module in (common, digital, lanes))
     for index in folder.glob(f"{name}.*.nbi"):
         with suppress(FileNotFoundError):  # another process was first
             if index.stat().st_mtime < inlined:
