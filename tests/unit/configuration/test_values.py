@@ -12,7 +12,7 @@ from memcomp_lightning.configuration.composing import composing
 from memcomp_lightning.configuration.values import check_kinds
 from memcomp_lightning.errors import SettingError
 
-CONF = Path(__file__).parents[2] / "conf"
+CONF = Path(__file__).parents[3] / "conf"
 OPTIONS = [
     f"{group}={path.stem}"
     for group in ("sampler", "solver", "positive", "pretrain", "model", "data")

@@ -11,7 +11,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.solvers import BruteForce
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "solver_benchmark"))
+sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_benchmark"))
 pytest.importorskip("numba")
 from exact import branch_and_bound, highs
 from families import families

@@ -636,7 +636,7 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
 
 def test_passes_of_the_page_take_the_same_steps():
     """The example of docs/extending.md: one row of the table, and the kernel integrates its field."""
-    page = (Path(__file__).parents[2] / "docs/extending.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[4] / "docs/extending.md").read_text(encoding="utf-8")
     (block,) = [b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "class Gradient" in b]
     made = {}
     exec(compile(block, "extending.md", "exec"), made)

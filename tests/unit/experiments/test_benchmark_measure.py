@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "solver_benchmark"))
+sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_benchmark"))
 import measure
 from measure import Tally
 

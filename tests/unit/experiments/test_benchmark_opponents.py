@@ -12,7 +12,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.enumeration import binary_states
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "solver_benchmark"))
+sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_benchmark"))
 from instances import beasley, random_max_sat, random_rbm
 from side_by_side import SOLVERS, Dmm, DmmBond
 

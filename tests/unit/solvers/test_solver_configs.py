@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver
 
-SOLVER = Path(__file__).parents[2] / "conf" / "solver"
+SOLVER = Path(__file__).parents[3] / "conf" / "solver"
 
 
 @pytest.mark.parametrize(
