@@ -5,15 +5,13 @@ A source (:class:`Digits`, :class:`Mnist`, ...) is a frozen set of settings whos
 """
 
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression
-from memcomp_lightning.data.digits import Digits
 from memcomp_lightning.data.idx import CorruptFileError
 from memcomp_lightning.data.images import ImageData, ImageSource, PixelLayout
 from memcomp_lightning.data.loading import Batches, SparseRows
-from memcomp_lightning.data.mnist import Mnist, ReducedMnist
 from memcomp_lightning.data.module import ImageDataModule
 from memcomp_lightning.data.pixels import GreySource
 from memcomp_lightning.data.reduce import SIX_BY_SIX_WITHOUT_CORNERS, reduce_images
-from memcomp_lightning.data.synthetic import BarsAndStripes, ShiftingBars
+from memcomp_lightning.data.sources import BarsAndStripes, Digits, Mnist, ReducedMnist, ShiftingBars
 
 __all__ = [
     "SIX_BY_SIX_WITHOUT_CORNERS",

@@ -105,6 +105,14 @@ class ImageSource(Protocol):
         ...
 
 
+def same_patterns(
+    v: Tensor, label: Tensor, n_classes: int, layout: PixelLayout, name: str, copies: int
+) -> ImageData:
+    """Data whose test set is all patterns, and whose training set holds each of them so many times."""
+    train_v, train_label = v.repeat(copies, 1), label.repeat(copies)
+    return ImageData(train_v, train_label, v, label, n_classes, layout, name)
+
+
 def _check_shapes(subset: str, v: Tensor, label: Tensor, layout: PixelLayout) -> None:
     name = f"{subset}_v"
     require(v.dtype == torch.float32, f"{name}.dtype", v.dtype, "torch.float32", "Convert with .float().")
