@@ -2,9 +2,9 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.table import (
@@ -18,7 +18,7 @@ from memcomp_lightning.runs.table import (
 
 
 def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, Any]]], path: Path) -> str:
-    """Write the results of a sweep as CSV, and return them as a table for the screen: a row for each setting.
+    """A row for each setting, for the screen; the same as CSV in a file.
 
     Mean and standard error are over seeds and replicas. Settings that all runs share are left out.
 
@@ -29,75 +29,56 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
     settings = [dict(key) for key in groups]
     names = list(dict.fromkeys(name for setting in settings for name in setting))
     swept = [name for name in names if len({setting.get(name) for setting in settings}) > 1]
-    held_out = any("validation_accuracy" in result for results in groups.values() for result in results)
-    held_out_title = ["held-out accuracy"] if held_out else []
-    screen = [
-        [
-            *swept,
-            "runs x replicas",
-            "energy gap, top layer",
-            f"{LIKELIHOOD_TITLE}, first layer",
-            *held_out_title,
-            "test accuracy",
-            "wall time",
-        ]
-    ]
-    sheet: list[list[Any]] = [
-        [
-            *swept,
-            "n_runs",
-            "n_values",
-            "energy_gap_mean",
-            "energy_gap_error",
-            "log_likelihood_mean",
-            "log_likelihood_error",
-            *(["validation_accuracy_mean", "validation_accuracy_error"] if held_out else []),
-            "test_accuracy_mean",
-            "test_accuracy_error",
-            "wall_time_s",
-        ]
-    ]
+    screen = [[*swept, "runs x replicas", *(measure.title for measure in _MEASURES), "wall time"]]
+    numbers = [f"{measure.name}_{what}" for measure in _MEASURES for what in ("mean", "error")]
+    sheet: list[list[Any]] = [[*swept, "n_runs", "n_values", *numbers, "wall_time_s"]]
     for setting, results in sorted(
         zip(settings, groups.values(), strict=True), key=lambda pair: _order(pair[0], swept)
     ):
-        gaps = [
-            gap
-            for result in results
-            for gap in (result["stages"].get("pretrain", {}).get("energy_gap") or [[]])[-1]
-        ]
-        nats = [value for result in results for layer in final_log_likelihoods(result)[:1] for value in layer]
-        accuracies = [accuracy for result in results for accuracy in result.get("test_accuracy", [])]
-        judged = [accuracy for result in results for accuracy in result.get("validation_accuracy", [])]
+        found = {m.name: [x for result in results for x in m.of(result)] for m in _MEASURES}
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
-        values = [setting.get(name, "") for name in swept]
-        n_values = max(len(gaps), len(accuracies))
-        screen.append(
-            [
-                *values,
-                f"{len(results)} x {n_values // len(results)}",
-                with_error(gaps) if gaps else "",
-                with_error(nats, digits=2) if nats else "",
-                *([with_error(judged) if judged else ""] if held_out else []),
-                with_error(accuracies) if accuracies else "",
-                f"{sum(seconds) / len(seconds):.1f} s",
-            ]
-        )
-        sheet.append(
-            [
-                *values,
-                len(results),
-                n_values,
-                *(mean_and_error(gaps) if gaps else ("", "")),
-                *(mean_and_error(nats) if nats else ("", "")),
-                *((mean_and_error(judged) if judged else ("", "")) if held_out else ()),
-                *(mean_and_error(accuracies) if accuracies else ("", "")),
-                sum(seconds) / len(seconds),
-            ]
-        )
+        own, mean_s = [setting.get(name, "") for name in swept], sum(seconds) / len(seconds)
+        n_values = max(len(found["energy_gap"]), len(found["test_accuracy"]))
+        cells = [with_error(found[m.name], digits=m.digits) if found[m.name] else "" for m in _MEASURES]
+        screen.append([*own, f"{len(results)} x {n_values // len(results)}", *cells, f"{mean_s:.1f} s"])
+        pairs = [mean_and_error(values) if values else ("", "") for values in found.values()]
+        sheet.append([*own, len(results), n_values, *(x for pair in pairs for x in pair), mean_s])
+    shown = [column for column, title in enumerate(sheet[0]) if not _left_out(title, sheet, column)]
     buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(sheet)
+    csv.writer(buffer, lineterminator="\n").writerows([row[column] for column in shown] for row in sheet)
     write_text(path, buffer.getvalue())
     return aligned(without_empty_columns(screen))
+
+
+class _Measure(NamedTuple):
+    """A column: its name in the CSV, its title on the screen, its numbers in the result of a run."""
+
+    name: str
+    title: str
+    of: Callable[[dict[str, Any]], list[float]]
+    digits: int = 4
+
+
+_MEASURES = (
+    _Measure(
+        "energy_gap",
+        "energy gap, top layer",
+        lambda result: (result["stages"].get("pretrain", {}).get("energy_gap") or [[]])[-1],
+    ),
+    _Measure(
+        "log_likelihood",
+        f"{LIKELIHOOD_TITLE}, first layer",
+        lambda result: [x for layer in final_log_likelihoods(result)[:1] for x in layer],
+        digits=2,
+    ),
+    _Measure("validation_accuracy", "held-out accuracy", lambda result: result.get("validation_accuracy", [])),
+    _Measure("test_accuracy", "test accuracy", lambda result: result.get("test_accuracy", [])),
+)
+
+
+def _left_out(title: str, sheet: Sequence[Sequence[Any]], column: int) -> bool:
+    """Accuracies on held-out images have columns only where there are such images."""
+    return title.startswith("validation") and all(row[column] == "" for row in sheet[1:])
 
 
 def _order(setting: dict[str, str], names: list[str]) -> list[tuple[int, float, str]]:

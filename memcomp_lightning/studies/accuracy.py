@@ -14,9 +14,9 @@ from torch import Tensor
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import stacked
 from memcomp_lightning.modules import Classifier, EnergyPretraining
-from memcomp_lightning.studies.plan import Plan, Stage
+from memcomp_lightning.studies.plan import Plan, Stage, passes_without_trainer
 from memcomp_lightning.studies.records import Key, Record
-from memcomp_lightning.training import DivergedError, evaluate, finetune, pretrain
+from memcomp_lightning.training import DivergedError, evaluate, finetune
 from memcomp_lightning.types import Batch
 
 Progress = Callable[[str, int], None]
@@ -233,17 +233,7 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
         stage = plan.pretraining
         module, batches = stage.module, stage.data.train_batches(0, 1).to(device)
         assert isinstance(module, EnergyPretraining)
-        passes = pretrain(
-            module.pretraining,
-            batches,
-            module.sampler,
-            iterations=module.iterations,
-            optimizer=module.make_optimizer,
-            schedules=module.schedules,
-            centring=module.centring,
-            seed=seed,
-        )
-        for _ in passes:
+        for _ in passes_without_trainer(module, batches, seed=seed):
             pass
     plan.change_between_stages(seed)
     return plan

@@ -22,9 +22,9 @@ from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
-from memcomp_lightning.studies.plan import Plan, Stage
+from memcomp_lightning.studies.plan import Plan, Stage, passes_without_trainer
 from memcomp_lightning.studies.records import Key, Record
-from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass, pretrain
+from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass
 
 
 @dataclass(frozen=True)
@@ -168,20 +168,14 @@ def _add(record: Record, updates: int, seconds: float, values: Sequence[list[flo
 def _training(trial: LikelihoodTrial, plan: Plan, network: Any, batches: Batches) -> Training:
     """Layer by layer, or all units at once."""
     module = pretraining_of(plan)[1]
-    settings: dict[str, Any] = {
-        "optimizer": module.make_optimizer,
-        "schedules": module.schedules,
-        "centring": module.centring,
-    }
     done = 0
     if trial.greedy_passes:
-        for before in pretrain(
-            Greedy(network), batches, module.sampler, iterations=trial.greedy_passes, **settings
-        ):
+        greedy = Greedy(network)
+        for before in passes_without_trainer(module, batches, stage=greedy, iterations=trial.greedy_passes):
             done = before.number
     assert plan.stage_for is not None
     stage = plan.stage_for(network)
-    passes = pretrain(stage, batches, module.sampler, iterations=module.iterations, **settings)
+    passes = passes_without_trainer(module, batches, stage=stage)
     return Training(
         (after._replace(number=done + after.number) for after in passes),
         lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network),

@@ -1,6 +1,6 @@
 """A run as objects: its network, and the stages that train it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,8 +10,8 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.models import DBN, Randomiser
-from memcomp_lightning.modules import StageModule
-from memcomp_lightning.training import PretrainingStage
+from memcomp_lightning.modules import EnergyPretraining, StageModule
+from memcomp_lightning.training import Batches, Pass, PretrainingStage, pretrain
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,35 @@ class Stage:
     module: StageModule
     data: ImageDataModule
     callbacks: list[pl.Callback]
+
+
+def passes_without_trainer(
+    module: EnergyPretraining,
+    batches: Batches,
+    *,
+    stage: PretrainingStage | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
+) -> Iterator[Pass]:
+    """Train as a module would under a trainer; yield what is done, pass by pass.
+
+    Args:
+        module: The pretraining.
+        batches: Its images.
+        stage: Another network's, in the place of the module's.
+        iterations: Other than the module's.
+        seed: Of the random streams.
+    """
+    return pretrain(
+        stage or module.pretraining,
+        batches,
+        module.sampler,
+        iterations=module.iterations if iterations is None else iterations,
+        optimizer=module.make_optimizer,
+        schedules=module.schedules,
+        centring=module.centring,
+        seed=seed,
+    )
 
 
 @dataclass(frozen=True)
