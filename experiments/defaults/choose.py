@@ -9,7 +9,7 @@ import torch
 from hydra import compose
 
 from memcomp_lightning.configuration.choice import trial_of
-from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.studies import SideBySide
 
 SPLITS = (100, 101, 102)

@@ -19,8 +19,6 @@ class BestWeights(pl.Callback):
     the weights kept so far.
     """
 
-    changes_training = True
-
     def __init__(self) -> None:
         self._best = BestPass()
         self._score: Any = None

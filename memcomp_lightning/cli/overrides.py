@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.cli.arguments import CommandLine, parse
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
-from memcomp_lightning.configuration.composing import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
+from memcomp_lightning.configuration.composition import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, explain, unknown_setting
 from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.errors import UserError

@@ -7,7 +7,7 @@
 ['pretrain', 'finetune']
 """
 
-from memcomp_lightning.configuration.composing import composed_for, composing
+from memcomp_lightning.configuration.composition import composed_for, composing
 from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.configuration.trainers import trainer_of
 from memcomp_lightning.configuration.values import check_values, filled

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.configuration.composing import check_not_given, composed_for
+from memcomp_lightning.configuration.composition import check_not_given, composed_for
 from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import UserError, require, require_choice

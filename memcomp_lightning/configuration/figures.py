@@ -11,7 +11,7 @@ from hydra import compose
 from omegaconf import DictConfig
 
 from memcomp_lightning.configuration.choice import for_trial, trial_of, tried_values
-from memcomp_lightning.configuration.composing import check_not_given, composed_for
+from memcomp_lightning.configuration.composition import check_not_given, composed_for
 from memcomp_lightning.configuration.plans import build, check_without_trainer
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import require

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from memcomp_lightning.configuration.composing import composed_for
+from memcomp_lightning.configuration.composition import composed_for
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.errors import SettingError, require

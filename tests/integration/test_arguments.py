@@ -15,7 +15,7 @@ from memcomp_lightning import __version__
 from memcomp_lightning.cli import arguments
 from memcomp_lightning.cli.arguments import from_folder, read, with_path
 from memcomp_lightning.cli.overrides import _check_options
-from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.errors import UserError
 
 Run = Callable[..., Outcome]

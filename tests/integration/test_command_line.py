@@ -11,7 +11,7 @@ from hydra import compose
 from running import FAST, MOCK_QPU, Outcome
 
 import memcomp_lightning
-from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
 
 Run = Callable[..., Outcome]

@@ -16,7 +16,7 @@ from running import HANGS_AFTER, QUIET, Outcome
 
 from memcomp_lightning.cli import report
 from memcomp_lightning.cli.commands import report as pages
-from memcomp_lightning.configuration import composing
+from memcomp_lightning.configuration import composition
 from memcomp_lightning.studies import Records
 from memcomp_lightning.studies.results import at_best_validation
 
@@ -301,8 +301,8 @@ def test_a_curve_is_composed_once(memcomp_train: Run, monkeypatch: pytest.Monkey
         composed.append(tuple(overrides))
         return hydra.compose(name, overrides)
 
-    monkeypatch.setattr(composing, "compose", counted)
-    composing._composed.cache_clear()
+    monkeypatch.setattr(composition, "compose", counted)
+    composition._composed.cache_clear()
     outcome = memcomp_train(
         "experiment=figure4", *SMALL, NO_CONTROLS, "figure.iterations=[1]", "hydra.run.dir=run"
     )

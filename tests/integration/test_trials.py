@@ -8,7 +8,7 @@ import torch
 from hydra import compose
 from running import QUIET, Outcome
 
-from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.modules import Classifier
 from memcomp_lightning.studies.accuracy import pretrained

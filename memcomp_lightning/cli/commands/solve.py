@@ -14,7 +14,7 @@ from torch import Tensor
 from memcomp_lightning.cli.arguments import read
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line
-from memcomp_lightning.configuration.composing import CONFIG_MODULE
+from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.hydra_versions import MAIN
 from memcomp_lightning.configuration.problems import prepare
 from memcomp_lightning.errors import SettingError, UserError

@@ -24,7 +24,7 @@ from memcomp_lightning.cli.overrides import answering, check_command_line, searc
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.configuration import comparisons, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
-from memcomp_lightning.configuration.composing import CONFIG_MODULE
+from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
 from memcomp_lightning.configuration.plans import build, check_without_trainer

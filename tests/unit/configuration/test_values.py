@@ -8,7 +8,7 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.configuration import values
-from memcomp_lightning.configuration.composing import composing
+from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.values import check_kinds
 from memcomp_lightning.errors import SettingError
 
