@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -26,7 +27,14 @@ SMALL = [
 ]
 FIGURE = ["data=digits", "data.partitions=2", "figure.passes=[1,2]", "figure.iterations=[2]", "figure.workers=1"]
 FIGURE += ["figure.controls_at=[2]", "solver.max_steps=40", "solver.n_restarts=4"]
-WORTH = ["worth.replicas=2", "worth.choosing=1", "worth.points=3", "worth.rates=[0.3]", "worth.workers=1"]
+WORTH = [
+    "worth.data_sets.shifting_bars.passes=60",
+    "worth.replicas=2",
+    "worth.choosing=1",
+    "worth.points=3",
+    "worth.rates=[0.3]",
+    "worth.workers=1",
+]
 EXACT = ["data=shifting_bars", "model.hidden_sizes=[7]", "finetune.batch_size=9"]
 SAMPLERS = (
     "cd",
@@ -106,9 +114,29 @@ def left(folder: Path) -> dict[str, object]:
         elif path.name in ("result.json", "solution.json"):
             found |= {f"{place} {k}": v for k, v in numbers(json.loads(path.read_text()))}
         elif path.name in ("records.jsonl", "courses.jsonl"):
-            for number, line in enumerate(sorted(path.read_text().splitlines())):
-                found |= {f"{place}:{number} {k}": v for k, v in numbers(json.loads(line))}
+            for record in map(by_present_names, map(json.loads, path.read_text().splitlines())):
+                key = tuple(
+                    record.get(name) for name in ("data_set", "method", "value", "iterations", "seed", "choosing")
+                )
+                found |= {f"record {key} {k}": v for k, v in numbers({n: record[n] for n in ("at", "measures")})}
     return found
+
+
+def by_present_names(record: dict[str, Any]) -> dict[str, Any]:
+    """A record as it is written now, from one of version 0.2.0 or before."""
+    if "curve" in record:
+        old = ("curve", "choice", "passes", "scores")
+    elif "rate" in record:
+        old = ("method", "rate", "updates", "measures")
+        names = {"scores": "score", "reverse": "reverse", "cosines": "cosine", "errors": "relative_error"}
+        measures = {name: record[before] for before, name in names.items() if record[before]}
+        record = {**record, "measures": measures, "iterations": None, "seed": None, "choosing": False}
+    else:
+        return {**record, "data_set": record["data_set"] or None}
+    return {
+        **record,
+        **{now: record[name] for name, now in zip(old, ("method", "value", "at", "measures"), strict=True)},
+    }
 
 
 def same(one: object, other: object) -> bool:
