@@ -12,7 +12,7 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.solvers import QuboSolver
-from memcomp_lightning.solvers.dmm import DmmSolver, Recording
+from memcomp_lightning.solvers.dmm import DmmSolver, Recording, Trajectory
 
 
 class TrajectoryFigure(EveryIterations):
@@ -52,7 +52,7 @@ class TrajectoryFigure(EveryIterations):
             return
         problem = _first(from_model(model_of(pl_module)))
         solution = self.solver.minimise(problem, generator=rng.stream(self.seed, "trajectory"))
-        if solution.trajectory is None:
+        if not isinstance(solution.trajectory, Trajectory):
             raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")
         title = f"lowest energy {solution.best_energy.item():.4g}"
         write_figure(

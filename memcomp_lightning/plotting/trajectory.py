@@ -7,7 +7,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.solvers.base import Trajectory
+from memcomp_lightning.solvers.dmm.trajectory import Trajectory
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; they differ in lightness, too.
 _PATH, _BEST, _BOX = "#0072B2", "#D55E00", "0.35"

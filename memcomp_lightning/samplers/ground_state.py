@@ -84,8 +84,8 @@ def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor
         raise ValueError(
             "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
         )
-    assignments, dwell = solution.trajectory.assignments, solution.trajectory.low_energy_dwell()
-    return assignments.flatten(-3, -2).to(dtype), dwell.flatten(-2).to(dtype)
+    assignments, weight = solution.trajectory.assignments, solution.trajectory.weights()
+    return assignments.flatten(-3, -2).to(dtype), weight.flatten(-2).to(dtype)
 
 
 def _diagnostics(solution: QuboSolution) -> dict[str, Tensor]:

@@ -4,7 +4,7 @@ from memcomp_lightning.optional import on_demand
 from memcomp_lightning.solvers.alternating_descent import AlternatingDescent
 from memcomp_lightning.solvers.annealing import GibbsAnnealing
 from memcomp_lightning.solvers.answer import Answer, write_solution
-from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status, Trajectory
+from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedStates, Status
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
 
@@ -16,8 +16,8 @@ __all__ = [
     "GibbsAnnealing",
     "QuboSolution",
     "QuboSolver",
+    "RecordedStates",
     "Status",
-    "Trajectory",
     "write_solution",
 ]
 

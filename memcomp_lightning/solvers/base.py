@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from torch import Generator, Tensor
 
@@ -35,30 +35,21 @@ _ADVICE = {
     Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
     Status.INFEASIBLE: "Every state was examined: none satisfies all hard clauses; this one breaks the fewest.",
     Status.ROUNDED: "The search was complete, but float64 rounds sums of these numbers: another may be lower.",
-    Status.NOT_RUN: "Not run: `patience` restarts had passed without a better assignment.",
+    Status.NOT_RUN: "Not run: enough restarts before it had found nothing better.",
 }
 
 
-class Trajectory(NamedTuple):
-    """What a solver passed through, recorded at intervals.
+class RecordedStates(Protocol):
+    """States that a solver passed through, as samples of low energy."""
 
-    Attributes:
-        time: Machine time of each record, ``(*problems, n_restarts, n_records)``.
-        unsatisfied_weight: Total weight of unsatisfied clauses then, same shape.
-        assignments: The digital state then, ``(*problems, n_restarts, n_records, n)``, bool.
-        dwell: Machine time since the record before, its weight in a time average, same shape as ``time``.
-    """
+    @property
+    def assignments(self) -> Tensor:
+        """``(*problems, n_restarts, n_records, n)``, bool."""
+        ...
 
-    time: Tensor
-    unsatisfied_weight: Tensor
-    assignments: Tensor
-    dwell: Tensor
-
-    def low_energy_dwell(self) -> Tensor:
-        """Weights for a time average without the start: ``dwell``, but 0 until the weight falls to its median."""
-        weight = self.unsatisfied_weight
-        reached = (weight <= weight.median(-1, keepdim=True).values).cummax(-1).values
-        return self.dwell * reached
+    def weights(self) -> Tensor:
+        """How much each of them counts in an average, >= 0, ``(*problems, n_restarts, n_records)``."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +62,7 @@ class QuboSolution:
         status: ``(*problems, n_restarts)`` int64, values of :class:`Status`.
         steps: ``(*problems, n_restarts)`` int64, integration steps or sweeps done.
         wall_time_s: Seconds for all problems and restarts together.
-        trajectory: The recorded trajectory, if the solver was asked for it.
+        trajectory: What the solver passed through, if it was asked to record it.
     """
 
     assignments: Tensor
@@ -79,7 +70,7 @@ class QuboSolution:
     status: Tensor
     steps: Tensor
     wall_time_s: float
-    trajectory: Trajectory | None = None
+    trajectory: RecordedStates | None = None
 
     @property
     def best_energy(self) -> Tensor:

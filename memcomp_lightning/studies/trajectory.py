@@ -10,8 +10,7 @@ from memcomp_lightning.files import write_text
 from memcomp_lightning.models import DBN
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import from_model
-from memcomp_lightning.solvers import Trajectory
-from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.solvers.dmm import DmmSolver, Trajectory
 from memcomp_lightning.studies.accuracy import pretrained
 from memcomp_lightning.studies.plan import Plan
 from memcomp_lightning.studies.report import save
@@ -32,7 +31,7 @@ def draw_trajectory(plan: Plan, solver: DmmSolver, *, seed: int, folder: Path) -
     rbm, n = plan.network[0], plan.pretraining.module.iterations
     with torch.no_grad():
         solution = solver.minimise(from_model(rbm), generator=rng.stream(seed, "solver"))
-    assert solution.trajectory is not None
+    assert isinstance(solution.trajectory, Trajectory)
     first = tuple(0 for _ in rbm.replicas)
     trajectory = Trajectory(*(values[first] for values in solution.trajectory))
     data = plan.pretraining.data.images.name

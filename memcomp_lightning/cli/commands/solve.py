@@ -22,7 +22,8 @@ from memcomp_lightning.files import written_whole
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import Problem, ProblemFileError, in_full
 from memcomp_lightning.runs.table import short_path
-from memcomp_lightning.solvers import Answer, QuboSolution, QuboSolver, Trajectory, write_solution
+from memcomp_lightning.solvers import Answer, QuboSolution, QuboSolver, write_solution
+from memcomp_lightning.solvers.dmm import Trajectory
 from memcomp_lightning.solvers.solving import memory_needed, minimise
 
 COMMAND = "memcomp-solve"
@@ -96,7 +97,7 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
         folder.mkdir(parents=True, exist_ok=True)
         write_solution(file, problem, solution, solver=settings, seed=config.seed)
         written = True
-        if solution.trajectory is not None:
+        if isinstance(solution.trajectory, Trajectory):
             picture = _draw(folder, problem.name, solution.trajectory)
     except OSError as error:
         lost = f"folder {folder} cannot be written ({error.strerror}): choose another with hydra.run.dir=PATH"

@@ -12,6 +12,7 @@ from memcomp_lightning.solvers.dmm.integrate import (
     Strang,
 )
 from memcomp_lightning.solvers.dmm.solver import DmmSolver, WarmRestart, default_quench, default_steps
+from memcomp_lightning.solvers.dmm.trajectory import Trajectory
 
 __all__ = [
     "AdaptiveEuler",
@@ -24,6 +25,7 @@ __all__ = [
     "Recording",
     "Splitting",
     "Strang",
+    "Trajectory",
     "VectorField",
     "WarmRestart",
     "default_quench",

@@ -18,12 +18,13 @@ from memcomp_lightning.errors import require, require_choice, require_count, req
 from memcomp_lightning.problems.graph import Bipartite, EdgeList
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.qubo import Qubo
-from memcomp_lightning.solvers.base import QuboSolution, Status, Trajectory
+from memcomp_lightning.solvers.base import QuboSolution, Status
 from memcomp_lightning.solvers.dmm.base import Recording, VectorField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.kernels import reference
 from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start
+from memcomp_lightning.solvers.dmm.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import Qubo
-from memcomp_lightning.solvers import Trajectory
-from memcomp_lightning.solvers.dmm import DmmSolver, Recording
+from memcomp_lightning.solvers.dmm import DmmSolver, Recording, Trajectory
 
 
 def trajectory_of(weight, dwell=None):

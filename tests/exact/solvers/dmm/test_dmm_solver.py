@@ -704,7 +704,7 @@ def test_restarts_not_run_have_records_of_no_duration(kernel):
 def test_low_energy_stretch_begins_where_the_weight_first_falls_to_its_median(kernel):
     trajectory = recorded(problems=(2, 3), patience=2, every=3, max_steps=101, kernel=kernel)[1].trajectory
     weights, dwells = (x.flatten(0, 2).tolist() for x in (trajectory.unsatisfied_weight, trajectory.dwell))
-    found = trajectory.low_energy_dwell().flatten(0, 2).tolist()
+    found = trajectory.weights().flatten(0, 2).tolist()
     shortened = 0
     for weight, dwell, ours in zip(weights, dwells, found, strict=True):
         median = sorted(weight)[(len(weight) - 1) // 2]
@@ -729,10 +729,10 @@ def test_time_average_weights_each_record_by_its_duration(replicas, patience):
     v, h, weight = negative.configurations
     assert v.shape == (*replicas, 7 * 17, 7)
     assert torch.cat((v, h), -1).equal(trajectory.assignments.flatten(-3, -2).double())
-    assert weight.equal(trajectory.low_energy_dwell().flatten(-2))
+    assert weight.equal(trajectory.weights().flatten(-2))
     qubo = from_model(rbm)
     energies = qubo.energy(torch.cat((v, h), -1))
-    average = (energies * weight).sum(-1) / trajectory.low_energy_dwell().sum((-1, -2))
+    average = (energies * weight).sum(-1) / trajectory.weights().sum((-1, -2))
     torch.testing.assert_close(rbm.mean_energy(negative.configurations).detach(), average)
 
 
