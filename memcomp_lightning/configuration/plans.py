@@ -1,6 +1,7 @@
 """From a configuration to the objects of a run; everything that can be refused is refused here."""
 
 import copy
+import inspect
 import math
 import re
 from collections.abc import Hashable, Mapping
@@ -22,7 +23,7 @@ from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.values import check_values
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
-from memcomp_lightning.models import DBN, BoltzmannMachine, energy_models, start_at_means
+from memcomp_lightning.models import DBN, energy_models, start_at_means
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
 from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
@@ -206,7 +207,7 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
     if isinstance(settings.get("connectivity"), dict):
         settings["connectivity"] = {**settings["connectivity"], "n_visible": images.layout.n_visible}
     factory = instantiate(settings, _partial_=True, _convert_="all")
-    if not issubclass(get_class(settings["_target_"]), DBN | BoltzmannMachine):
+    if "n_classes" in inspect.signature(get_class(settings["_target_"])).parameters:
         arguments["n_classes"] = images.n_classes
     try:
         network: nn.Module = factory(**arguments)

@@ -8,7 +8,6 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.models import BoltzmannMachine
 
 
 class CheckpointError(ValueError):
@@ -72,9 +71,8 @@ def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> Non
             that are coupled otherwise, and what to do.
     """
     own = module.state_dict()
-    couplings = {
-        f"{name}.pairs".lstrip("."): m for name, m in module.named_modules() if isinstance(m, BoltzmannMachine)
-    }
+    models: dict[str, Any] = dict(module.named_modules())
+    couplings = {f"{name}.pairs".lstrip("."): m for name, m in models.items() if hasattr(m, "other_pairs")}
     if {"state_dict", "process_states"} <= state_dict.keys():
         raise CheckpointError(
             f"checkpoint {path} is one of a stage in training, not a weight file: use a file of the folder "
