@@ -86,7 +86,7 @@ class LogLikelihood(EveryIterations):
         n_images: int = 1000,
         max_units: int = 25,
         n_chains: int = 100,
-        n_betas: int = 1000,
+        n_betas: int = 300,
         seed: int = 0,
     ) -> None:
         super().__init__(1 if every is None else every)

@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Generator, Tensor
 
+from memcomp_lightning.defaults import N_CHAINS
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -32,16 +33,15 @@ class PCD:
     shared: ClassVar[bool] = False
 
     k: int = 1
-    n_chains: int | None = None
+    n_chains: int | None = N_CHAINS
     chains_per_datum: int = 1
 
     def __post_init__(self) -> None:
         require_count("k", self.k)
         require_count("chains_per_datum", self.chains_per_datum)
-        per_datum, allowed = self.chains_per_datum, "1 where n_chains is given"
-        require(
-            per_datum == 1 or self.n_chains is None, "chains_per_datum", per_datum, allowed, "Use n_chains=null."
-        )
+        alone = self.chains_per_datum == 1 or self.n_chains is None
+        remedy = "Use n_chains=None, on the command line null."
+        require(alone, "chains_per_datum", self.chains_per_datum, "1 where n_chains is given", remedy)
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
 

@@ -29,7 +29,7 @@ class BranchAndBound:
         max_nodes: Partial states to look at before a problem is given up, >= 1; its best state is still returned.
     """
 
-    max_nodes: int = 10**9
+    max_nodes: int = 10**8
 
     def __post_init__(self) -> None:
         require_count("max_nodes", self.max_nodes)

@@ -20,7 +20,7 @@ class ExactPosterior:
         max_units: Hidden units at most, 1 to 16: 2^max_units configurations an image.
     """
 
-    max_units: int = 10
+    max_units: int = 16
 
     def __post_init__(self) -> None:
         require_count("max_units", self.max_units)
