@@ -1,12 +1,22 @@
 """Tell the user why the first use of a compiled kernel takes a while."""
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 log = logging.getLogger(__name__)
+
+_begun: list[float] = []
+_spent: list[float] = []
+
+
+def seconds_spent() -> float:
+    """Seconds that numba has compiled in this process since :func:`announce_compilation`."""
+    return sum(_spent)
+
 
 _PARTS = {"likelihood": "the likelihood's kernel"}
 
@@ -25,8 +35,14 @@ def announce_compilation() -> None:
             if package == __package__:
                 _log_once(_PARTS.get(name.partition(".")[0], "the solver's kernels"))
 
+            if not _begun:
+                _spent.append(0.0)
+            _begun.append(time.perf_counter())
+
         def on_end(self, event: Any) -> None:
-            pass
+            begin = _begun.pop()
+            if not _begun:  # what is compiled for another function counts with it
+                _spent[-1] = time.perf_counter() - begin
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
 

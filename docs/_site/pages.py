@@ -252,8 +252,23 @@ def group_page(group: str) -> str:
     for item in options(group):
         mark = " (default)" if chosen.get(group) == item.name else ""
         parts += [f"## {item.name}{mark} {{#{item.name}}}", item.text]
-        parts += [f"On the command line `{group}={item.name}`" + class_text(item) + ":", fenced(item.yaml)]
+        parts += [f"On the command line {typed(group, item.name)}" + class_text(item) + ":", fenced(item.yaml)]
     return "\n\n".join(parts) + "\n"
+
+
+SET_BY = {
+    "figure": "an `experiment` sets it: `experiment={option}`",
+    "figure/curves": "`figure/curves={option}`, beside an `experiment` that is a figure",
+    "worth": "an `experiment` sets it: `experiment=sampler_worth` or `experiment=joint_likelihood`",
+    "preset/figure": "`preset={option}`, beside an `experiment` that is a figure",
+    "hparams": "`-m hparams={option}`",
+}
+"""Groups that are not chosen by their name alone."""
+
+
+def typed(group: str, option: str) -> str:
+    """How an option is chosen."""
+    return SET_BY.get(group, f"`{group}={{option}}`").format(option=option)
 
 
 def class_text(item: Option) -> str:

@@ -1,5 +1,6 @@
 """Reads what was typed: Hydra's flags, and overrides, rewritten so that Hydra reads them as they were meant."""
 
+import difflib
 import glob
 import re
 import shlex
@@ -356,7 +357,10 @@ def _refuse_flag(message: str) -> NoReturn:
 
 def _refuse_unknown(argument: str, flags: Sequence[str]) -> NoReturn:
     name = argument.lstrip("-").partition("=")[0].replace("-", "_")
-    remedy = f"Settings have no dashes before them: {name}=VALUE." if len(name) > 1 else ""
+    close = difflib.get_close_matches(argument, flags, n=1) if argument.startswith("--") else []
+    remedy = f"Did you mean {close[0]}?" if close else ""
+    if not close and len(name) > 1:
+        remedy = f"Settings have no dashes before them: {name}=VALUE."
     raise UserError(f"{argument} is no option. {remedy} Options: {', '.join(flags)}.".replace("  ", " "))
 
 

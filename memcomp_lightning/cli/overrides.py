@@ -29,6 +29,8 @@ from memcomp_lightning.runs.paths import is_path
 
 _SEARCHES = ("hparams=", "hydra/sweeper=")
 
+_SET_BY_EXPERIMENTS = ("figure", "worth")
+
 LONGEST_NAME = 150
 """Characters of a job's folder; file systems allow 255."""
 
@@ -199,6 +201,11 @@ def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[s
             and name in plain().hydra.runtime.choices
         ):
             raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
+        if name in _SET_BY_EXPERIMENTS and not (override.is_add() or override.is_force_add()):
+            raise UserError(
+                f"{typed} is not possible: an experiment sets it. Write experiment=NAME. Known here: "
+                f"{', '.join(loader.get_group_options('experiment'))}."
+            )
         if name in groups and not override.is_delete() and not override.is_sweep_override():
             value = override.value()
             allowed = value is None and plain().hydra.runtime.choices.get(name) is None

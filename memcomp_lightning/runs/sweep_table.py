@@ -12,6 +12,7 @@ from memcomp_lightning.runs.table import (
     aligned,
     final_log_likelihoods,
     mean_and_error,
+    terminal_width,
     with_error,
     without_empty_columns,
 )
@@ -47,7 +48,7 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows([row[column] for column in shown] for row in sheet)
     write_text(path, buffer.getvalue())
-    return aligned(without_empty_columns(screen))
+    return aligned(without_empty_columns(screen), most=terminal_width())
 
 
 class _Measure(NamedTuple):

@@ -30,14 +30,28 @@ def with_error(values: Sequence[float], digits: int = 4) -> str:
     return f"{mean:.{digits}f}" if error is None else f"{mean:.{digits}f} ± {error:.{digits}f}"
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """The rows as text in columns that are aligned to the right; the first row is the header."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
-    lines.insert(1, "  ".join("─" * width for width in widths))
-    return "\n".join(lines)
+def aligned(rows: Sequence[Sequence[str]], *, most: int | None = None) -> str:
+    """The rows as text in columns that are aligned to the right; the first row is the header.
+
+    Args:
+        rows: Of cells.
+        most: Characters of a line; a header that makes it longer has its words below each other.
+    """
+    head, n = [[cell] for cell in rows[0]], len(rows[0])
+    if most is not None and sum(max(len(row[c]) for row in rows) + 2 for c in range(n)) - 2 > most:
+        head = [cell.split() for cell in rows[0]]
+    height = max(map(len, head))
+    head = [[""] * (height - len(words)) + words for words in head]
+    lines = [*zip(*head, strict=True), *rows[1:]]
+    widths = [max(len(line[column]) for line in lines) for column in range(n)]
+    texts = ["  ".join(cell.rjust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+    texts.insert(height, "  ".join("─" * width for width in widths))
+    return "\n".join(texts)
+
+
+def terminal_width() -> int | None:
+    """Columns of the terminal that is printed to; None where the output goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def final_log_likelihoods(result: dict[str, Any]) -> list[list[float]]:
@@ -66,13 +80,12 @@ def run_table(result: dict[str, Any]) -> str:
     if (independent := context.get("independent_units")) is not None:
         rows.append(["(independent units)", "", "", f"{independent['heldout']:.2f}", "", ""])
     if (regression := context.get("logistic_regression")) is not None:
-        name = f"(logistic regression, {regression['n_images']:,} images)"
-        rows.append([name, "", "", "", f"{regression['test_accuracy']:.4f}", ""])
+        rows.append(["(logistic regression)", "", "", "", f"{regression['test_accuracy']:.4f}", ""])
     choice = result.get("choice")
     chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
     judged = result.get("validation_accuracy")
     held_out = f"\nAccuracy on held-out training images: {with_error(judged)}" if judged else ""
-    return aligned(without_empty_columns(rows)) + chosen + held_out
+    return aligned(without_empty_columns(rows), most=terminal_width()) + chosen + held_out
 
 
 def without_empty_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:

@@ -103,6 +103,8 @@ REFUSED = {
     "pretrain.iterations=abc": ["pretrain.iterations = 'abc'", "an integer >= 0"],
     "finetune.iterations=1.5": ["finetune.iterations = 1.5", "an integer >= 0"],
     "solver.n_restarts=0": ["n_restarts = 0", "an integer >= 1"],
+    "figure=figure4": ["an experiment sets it", "experiment=NAME"],
+    "--hlep": ["--hlep is no option. Did you mean --help?"],
     "solver.patience=99": ["patience = 99", "1 to n_restarts = 28"],
     "solver.field.gamma=2": ["gamma = 2", "(0, 1/2)"],
     "pretrain.optimizer.lr=-1": ["pretrain.optimizer", "-1"],

@@ -34,7 +34,7 @@ def test_about_ten_likelihoods_a_stage_and_rows_of_context(memcomp_train: Run) -
     assert "log-likelihood (held-out)" in title
     assert "test accuracy" in title
     assert f"{values[-1]['heldout'][0]:.2f}" in outcome.out
-    assert "(logistic regression, 9 images)" in outcome.out
+    assert "(logistic regression)" in outcome.out
     assert "(independent units)" in outcome.out
 
 

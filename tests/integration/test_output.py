@@ -24,7 +24,7 @@ from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
 from memcomp_lightning.cli.output import say, tolerant_streams
 from memcomp_lightning.cli.overrides import claimed
-from memcomp_lightning.compiling import told
+from memcomp_lightning.compiling import seconds_spent, told
 from memcomp_lightning.configuration import trainers
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs import pipeline
@@ -367,10 +367,12 @@ def test_compilation_is_said_in_one_line(capfd: pytest.CaptureFixture[str]) -> N
     with told(lambda text: say(f"memcomp-train: {text}", error=True)):
         kernel("of.others")(1)
         assert capfd.readouterr().err == ""
+        before = seconds_spent()
         one(1)
         other(1)
         one(2)
         said = capfd.readouterr().err
+        assert seconds_spent() > before  # what solvers do not count as their time
     assert said == "memcomp-train: compiling the solver's kernels for this processor, once (about half a minute)\n"
 
 

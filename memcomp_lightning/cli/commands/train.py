@@ -248,6 +248,7 @@ def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 
 def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, Any]:
