@@ -134,8 +134,8 @@ def test_what_is_too_large_to_enumerate_is_refused():
         log_likelihood(BoltzmannMachine(2, 18), torch.zeros(1, 2), torch.zeros(()))
     with pytest.raises(SettingError, match="units to enumerate = 18"):
         Exact().init(BoltzmannMachine(10, 9), 1, generator=rng.stream(0, "unused"))
-    with pytest.raises(SettingError, match="number of hidden units = 11"):
-        ExactPosterior().sample(DBM(3, [7, 4]), torch.zeros(1, 3), generator=rng.stream(0, "unused"))
+    with pytest.raises(SettingError, match="number of hidden units = 17"):
+        ExactPosterior().sample(DBM(3, [10, 7]), torch.zeros(1, 3), generator=rng.stream(0, "unused"))
 
 
 def test_mean_field_says_whether_it_converged():

@@ -161,7 +161,7 @@ def test_the_estimate_makes_an_annealer_of_another_temperature_sample_the_model(
 
 
 @pytest.mark.parametrize("beta", [1.0, "estimate"])
-def test_a_large_model_costs_little(beta):
+def test_a_large_model_costs_little(beta, threads):
     """784 x 500: what is added to an annealer's own time, processor time, the least of eight updates."""
 
     class Instant(dimod.Sampler):
@@ -176,10 +176,11 @@ def test_a_large_model_costs_little(beta):
     sampler = AnnealerSamples(sampler=Instant(), beta=beta)
     positive, state = positive_phase(rbm, torch.zeros(1, 784)), sampler.init(rbm, 1, generator=generator)
     times = []
-    for _ in range(8):
-        begin = time.process_time()
-        sampler.sample(rbm, state, positive, generator=generator)
-        times.append(time.process_time() - begin)
+    with threads(1):  # others would spin, which counts
+        for _ in range(8):
+            begin = time.process_time()
+            sampler.sample(rbm, state, positive, generator=generator)
+            times.append(time.process_time() - begin)
     assert min(times) < 0.1  # medians of 39 and 42 ms on a quiet machine; neighbours take its caches
 
 
