@@ -47,7 +47,7 @@ def accuracies(overrides: list[str]) -> list[list[float]]:
     rows = []
     for seed in SPLITS:
         held_out = [f"data.source.split_seed={seed}", "data.validation_fraction=0.2"]
-        trial = trial_of(compose("config", [*overrides, *held_out]), "choose", seed=seed)
+        trial = trial_of(compose("config", [*overrides, *held_out, f"seed={seed}"]), "choose")
         (record,) = SideBySide((trial,), PASSES, 0).run(lambda what, n_updates: None)
         rows.append([of_pass[0] for of_pass in record.measures["validation_accuracy"]])
     return rows

@@ -60,13 +60,7 @@ def for_trial(config: DictConfig, value: float) -> DictConfig:
 
 
 def trial_of(
-    config: DictConfig,
-    method: str,
-    *,
-    value: float | None = None,
-    choosing: bool = False,
-    iterations: int | None = None,
-    seed: int | None = None,
+    config: DictConfig, method: str, *, value: float | None = None, choosing: bool = False
 ) -> AccuracyTrial:
     """A training with these settings.
 
@@ -75,16 +69,12 @@ def trial_of(
         method: Name of the trial.
         value: Of the setting that is chosen; None where nothing is.
         choosing: Whether the value is only tried.
-        iterations: Of pretraining; None is what the settings say.
-        seed: Likewise.
     """
     own = config
     if value is not None:
         own = for_trial(config, value) if choosing else with_choice(config, value)
     settings: Any = OmegaConf.to_container(own, resolve=False)
-    iterations = own.pretrain.iterations if iterations is None else iterations
-    seed = own.seed if seed is None else seed
-    return AccuracyTrial(method, settings, plan_of, iterations, seed, value, choosing)
+    return AccuracyTrial(method, settings, plan_of, own.pretrain.iterations, own.seed, value, choosing)
 
 
 def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str, Any] | None]:

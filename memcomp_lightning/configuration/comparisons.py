@@ -59,7 +59,8 @@ def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     comparison, records = _comparison(config), Records(folder)
     write_text(folder / "worth.json", json.dumps(asdict(comparison), indent=1) + "\n")
     (folder / "weights").mkdir(exist_ok=True)
-    missing = [trial for trial in _trials(comparison, overrides, folder) if trial.key not in records.keys]
+    done = records.keys
+    missing = [trial for trial in _trials(comparison, overrides, folder) if trial.key not in done]
     with runner(comparison.name, workers=comparison.workers) as run:
         run(missing, records)
 

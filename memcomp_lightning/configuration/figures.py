@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -156,9 +156,8 @@ def _trials(
         values, iterations, seeds = tried, iterations[-1:], seeds[:1]
     else:
         values = [records.best_value(name)] if tried else [None]
+    done = records.keys
     for value in values:
-        for n in iterations:
-            for seed in seeds:
-                trial = trial_of(composed, name, value=value, choosing=choosing, iterations=n, seed=seed)
-                if trial.key not in records.keys:
-                    yield trial
+        first = trial_of(composed, name, value=value, choosing=choosing)
+        trials = (replace(first, iterations=n, seed=seed) for n in iterations for seed in seeds)
+        yield from (trial for trial in trials if trial.key not in done)
