@@ -1,6 +1,8 @@
 """Tell the user why the first use of a compiled kernel takes a while."""
 
 import logging
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,6 +18,16 @@ _spent: list[float] = []
 def seconds_spent() -> float:
     """Seconds that numba has compiled in this process since :func:`announce_compilation`."""
     return sum(_spent)
+
+
+def n_threads() -> int:
+    """Threads for compiled code: as many as torch uses, or without torch OMP_NUM_THREADS or one a processor."""
+    if "torch" in sys.modules:
+        return int(sys.modules["torch"].get_num_threads())
+    from numba import config
+
+    given = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(given) if given.isdecimal() and int(given) else int(getattr(config, "NUMBA_NUM_THREADS", 1))
 
 
 _PARTS = {"likelihood": "the likelihood's kernel"}

@@ -1,17 +1,26 @@
 """Named random streams from one seed, and the draws that the package makes from them.
 
-No function of this package touches torch's global generator, so switching a callback on cannot change
-training.
+No function of this package touches a global generator, so switching a callback on cannot change training. Streams
+are torch's for models, and numpy's for problems from files, which are solved without torch.
 """
 
 import hashlib
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Generator, Tensor
+import numpy as np
+
+from memcomp_lightning.arrays import Array, alike, as_array, cast, namespace
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    Generator = torch.Generator | np.random.Generator
+    """A source of random numbers of either library."""
 
 
-def stream(seed: int, name: str, index: int = 0, device: torch.device | str = "cpu") -> Generator:
+def stream(seed: int, name: str, index: int = 0, device: "torch.device | str" = "cpu") -> "torch.Generator":
     """Return the generator of one named stream.
 
     Streams of different names or indices (a process rank, an epoch) are independent; the same three values
@@ -21,23 +30,33 @@ def stream(seed: int, name: str, index: int = 0, device: torch.device | str = "c
     >>> bool(uniform((3,), generator=a).equal(uniform((3,), generator=b)))
     True
     """
-    digest = hashlib.sha256(f"{seed}/{name}/{index}".encode()).digest()
+    from torch import Generator
+
     generator = Generator(device=device)
-    generator.manual_seed(int.from_bytes(digest[:8], "big", signed=True))
+    generator.manual_seed(int.from_bytes(_digest(seed, name, index), "big", signed=True))
     return generator
 
 
-def streams(seed: int, names: Iterable[str], index: int = 0) -> dict[str, Generator]:
+def numpy_stream(seed: int, name: str, index: int = 0) -> np.random.Generator:
+    """Return a generator of numpy, as :func:`stream` does of torch."""
+    return np.random.default_rng(int.from_bytes(_digest(seed, name, index), "big"))
+
+
+def _digest(seed: int, name: str, index: int) -> bytes:
+    return hashlib.sha256(f"{seed}/{name}/{index}".encode()).digest()[:8]
+
+
+def streams(seed: int, names: Iterable[str], index: int = 0) -> "dict[str, torch.Generator]":
     """Return one generator a name, see :func:`stream`."""
     return {name: stream(seed, name, index) for name in names}
 
 
-def save(generators: dict[str, Generator]) -> dict[str, Tensor]:
+def save(generators: "dict[str, torch.Generator]") -> "dict[str, Tensor]":
     """Return the states of the generators as plain byte tensors."""
     return {name: generator.get_state() for name, generator in generators.items()}
 
 
-def restore(generators: dict[str, Generator], states: dict[str, Tensor]) -> None:
+def restore(generators: "dict[str, torch.Generator]", states: "dict[str, Tensor]") -> None:
     """Set the generators to states that :func:`save` returned.
 
     Raises:
@@ -49,13 +68,32 @@ def restore(generators: dict[str, Generator], states: dict[str, Tensor]) -> None
         generator.set_state(states[name].cpu())
 
 
-def uniform(shape: Iterable[int], *, generator: Generator, like: Tensor | None = None) -> Tensor:
-    """Draw from U[0, 1) on the generator's device, in float32 or the dtype of ``like``, moved to its device."""
-    draw = torch.empty(tuple(shape), device=generator.device, dtype=torch.float32 if like is None else like.dtype)
-    draw.uniform_(generator=generator)
-    return draw if like is None else draw.to(like.device)
+def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None = None) -> Array:
+    """Draw from U[0, 1) in float32 or the dtype of ``like``, as an array of its library on its device.
+
+    Without ``like`` it is an array of the generator's library.
+    """
+    if isinstance(generator, np.random.Generator):
+        dtype = np.float64 if like is not None and like.dtype == namespace(like).float64 else np.float32
+        draw = as_array(generator.random(tuple(shape), dtype=dtype))
+        return draw if like is None else cast(alike(draw, like), like.dtype)
+    import torch
+
+    of_numpy = isinstance(like, np.ndarray)
+    wanted = torch.float32 if like is None else getattr(torch, str(like.dtype)) if of_numpy else like.dtype
+    draw = torch.empty(tuple(shape), device=generator.device, dtype=wanted).uniform_(generator=generator)
+    return draw if like is None else alike(draw, like) if of_numpy else draw.to(like.device)
 
 
-def bernoulli(probability: Tensor, *, generator: Generator) -> Tensor:
+def bernoulli(probability: Array, *, generator: "Generator") -> Array:
     """Draw {0, 1} with the given probabilities, same shape, dtype and device."""
-    return (uniform(probability.shape, generator=generator, like=probability) < probability).to(probability.dtype)
+    return cast(uniform(probability.shape, generator=generator, like=probability) < probability, probability.dtype)
+
+
+def integers(n: int, shape: Iterable[int], *, generator: "Generator", like: Array) -> Array:
+    """Draw int64 from 0 to n - 1, as an array of the library of ``like`` on its device."""
+    if isinstance(generator, np.random.Generator):
+        return alike(generator.integers(n, size=tuple(shape)), like)
+    import torch
+
+    return alike(torch.randint(n, tuple(shape), generator=generator, device=generator.device), like)

@@ -26,14 +26,17 @@ from jaxtyping import AbstractArray, install_import_hook
 from memcomp_lightning import rng
 
 if SEED := os.environ.get("MEMCOMP_SEED"):
-    usual_stream = rng.stream
 
-    @functools.wraps(usual_stream)
-    def stream(seed, name, *args, **kwargs):
-        # The models stay: on them depends how many samples tell a wrong sampler from a right one.
-        return usual_stream(seed if name == "test model" else f"{SEED}/{seed}", name, *args, **kwargs)
+    def reseeded(usual):
+        @functools.wraps(usual)
+        def stream(seed, name, *args, **kwargs):
+            # The models stay: on them depends how many samples tell a wrong sampler from a right one.
+            return usual(seed if name == "test model" else f"{SEED}/{seed}", name, *args, **kwargs)
 
-    rng.stream = stream  # before another module takes it from there
+        return stream
+
+    # Before another module takes them from there.
+    rng.stream, rng.numpy_stream = reseeded(rng.stream), reseeded(rng.numpy_stream)
 
 
 def is_shape(hint):

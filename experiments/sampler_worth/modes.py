@@ -10,8 +10,8 @@ import torch
 from exact import model_of
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.problems import from_model
 from memcomp_lightning.solvers import GibbsAnnealing
 from memcomp_lightning.solvers.dmm import DmmSolver

@@ -8,6 +8,7 @@ import torch
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array
 
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems import Bipartite, Qubo
 from memcomp_lightning.solvers.kernels.branch_and_bound import search
@@ -47,7 +48,7 @@ def branch_and_bound(qubo: Qubo, *, incumbent: float = np.inf, max_nodes: int = 
 
 def highs(qubo: Qubo, *, time_limit: float) -> Proof:
     """Mixed-integer program, y_ij for x_i x_j: y <= x_i and y <= x_j where y pays, else y >= x_i + x_j - 1."""
-    pairs, value = qubo.graph.edges().numpy(), qubo.coupling.double().flatten().numpy()
+    pairs, value = to_numpy(qubo.graph.edges()), qubo.coupling.double().flatten().numpy()
     pairs, value = pairs[value != 0], value[value != 0]
     n, m = qubo.n, len(value)
     rows, columns, entries, upper = [], [], [], []

@@ -100,10 +100,10 @@ def random_max_sat(n: int, n_clauses: int, length: int, *, generator: Generator)
     variables = torch.empty(n_clauses, n).uniform_(generator=generator).topk(length).indices + 1
     signs = torch.randint(2, (n_clauses, length), generator=generator) * 2 - 1
     weights = torch.randint(1, 11, (n_clauses,), generator=generator)
-    return WeightedMaxSat.from_clauses(n, (variables * signs).tolist(), weights.tolist())
+    return WeightedMaxSat.from_clauses(n, (variables * signs).tolist(), weights.tolist()).alike(weights)
 
 
 def from_file(path: Path, *, maximise: bool = False) -> Qubo:
     """A G-set or Beasley file in float32, in which integers of these sizes are exact."""
-    problem = read_problem(path, maximise=maximise).problem
+    problem = read_problem(path, maximise=maximise).problem.alike(torch.zeros(()))
     return Qubo(problem.graph, problem.coupling.float(), problem.linear.float(), problem.offset.float())

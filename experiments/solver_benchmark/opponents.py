@@ -17,6 +17,7 @@ from dwave.samplers import SimulatedAnnealingSampler, TabuSampler
 from quadratise import quadratise
 from torch import Tensor
 
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.problems import Qubo, WeightedMaxSat
 
 Problem = Qubo | WeightedMaxSat
@@ -67,7 +68,7 @@ def model(problem: Problem) -> Model:
     """The spin form of a problem; the last two are kept."""
     begin = time.perf_counter()
     qubo = quadratise(problem)
-    pairs, coupling = qubo.graph.edges().numpy(), qubo.coupling.double().flatten().numpy()
+    pairs, coupling = to_numpy(qubo.graph.edges()), qubo.coupling.double().flatten().numpy()
     used = coupling != 0
     (i, j), coupling = pairs[used].T, coupling[used]
     vectors = qubo.linear.double().numpy(), (i, j, coupling), float(qubo.offset)

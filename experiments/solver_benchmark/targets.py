@@ -26,7 +26,7 @@ COUPLINGS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 
 
 def reference_solver() -> DmmSolver:
-    """The DMM on the torch reference kernel."""
+    """The DMM on the reference kernel."""
     return DmmSolver(kernel="reference")
 
 

@@ -12,7 +12,6 @@ from os import PathLike
 from typing import Any, Literal, TypeVar
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from torch import Tensor
 
 from memcomp_lightning.errors import require, require_choice
 
@@ -194,4 +193,4 @@ def _in_words(hint: Any) -> str:
 
 def _is_tensor(kind: Any) -> bool:
     """Torch's optimisers take these for numbers; a configuration has none."""
-    return isinstance(kind, type) and issubclass(kind, Tensor)
+    return isinstance(kind, type) and "Tensor" in {base.__name__ for base in kind.__mro__}

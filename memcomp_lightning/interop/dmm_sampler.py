@@ -4,9 +4,9 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.optional import WITHOUT_DIMOD
 from memcomp_lightning.solvers import QuboSolver, Status
 from memcomp_lightning.solvers.dmm import DmmSolver
@@ -66,9 +66,9 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         if num_reads is not None:
             solver = _with_reads(solver, num_reads)
         problem, variables = from_bqm(bqm)
-        solution = solver.minimise(problem, generator=rng.stream(0 if seed is None else seed, "solver"))
+        solution = solver.minimise(problem, generator=rng.numpy_stream(0 if seed is None else seed, "solver"))
         was_run = solution.status != int(Status.NOT_RUN)
-        x = solution.assignments[was_run].to(torch.int8).numpy()
+        x = to_numpy(solution.assignments)[to_numpy(was_run)].astype(np.int8)
         if bqm.vartype is dimod.SPIN:
             x = 2 * x - 1
         info = {"wall_time_s": solution.wall_time_s, "messages": solution.messages()}

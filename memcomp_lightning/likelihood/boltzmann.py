@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.layers import softplus
 from memcomp_lightning.models.base import Block, EnergyModel
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
 
 _NUMBERS = 2**23

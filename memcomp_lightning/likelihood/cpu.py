@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.compiling import announce_compilation
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.likelihood.kernel import PACK, sum_over_second
 from memcomp_lightning.likelihood.layers import Layers
-from memcomp_lightning.models.enumeration import binary_states
 
 announce_compilation()
 

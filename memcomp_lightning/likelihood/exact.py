@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states, bits
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import (
     log_hidden_sum,
@@ -16,7 +17,6 @@ from memcomp_lightning.likelihood.boltzmann import (
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
 from memcomp_lightning.models.base import EnergyModel, as_two_layers
-from memcomp_lightning.models.enumeration import binary_states, bits
 from memcomp_lightning.models.rbm import RBM
 
 MOST_HIDDEN = 16

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.likelihood.layers import Layers, log_weights
-from memcomp_lightning.models.enumeration import binary_states
 
 log = logging.getLogger(__name__)
 

@@ -10,11 +10,11 @@ from torch.linalg import vecdot
 from torch.nn.functional import softplus
 
 from memcomp_lightning.ambient import in_own_dtypes
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM

@@ -7,11 +7,11 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.ambient import in_own_dtypes
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
 from memcomp_lightning.models.chains import TwoLayerChains
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.solvers.dmm.trajectory import Trajectory
 
@@ -87,8 +88,8 @@ def _one_after_another(
     trajectory: Trajectory,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Times and weights ``(n_records,)`` of all restarts on one axis; where each begins, and the last one ends."""
-    time, weight = trajectory.time.double().cpu().numpy(), trajectory.unsatisfied_weight.double().cpu().numpy()
-    made = trajectory.dwell.cpu().numpy() > 0
+    time, weight, dwell = map(to_numpy, (trajectory.time, trajectory.unsatisfied_weight, trajectory.dwell))
+    made = dwell > 0
     was_run = made.any(1)
     time, weight, made = time[was_run], weight[was_run], made[was_run]
     starts = np.concatenate(([0.0], np.cumsum((time * made).max(1, initial=0.0))))

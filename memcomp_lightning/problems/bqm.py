@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-import torch
 
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.errors import require
 from memcomp_lightning.optional import WITHOUT_DIMOD
 from memcomp_lightning.problems.qubo import Qubo
@@ -24,12 +24,12 @@ def to_bqm(qubo: Qubo) -> BinaryQuadraticModel:
     Raises:
         SettingError: Several problems at once.
 
-    >>> float(to_bqm(Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))).energy({0: 1, 1: 1}))
+    >>> float(to_bqm(Qubo.from_matrix(np.array([[1.0, -3.0], [0.0, 1.0]]))).energy({0: 1, 1: 1}))
     -1.0
     """
     require(qubo.problems == (), "problems", qubo.problems, "one problem, without leading axes")
-    edges = qubo.graph.edges().cpu().numpy()
-    linear, coupling = (part.detach().double().cpu().flatten().numpy() for part in (qubo.linear, qubo.coupling))
+    edges = to_numpy(qubo.graph.edges())
+    linear, coupling = (to_numpy(part).astype(np.float64).ravel() for part in (qubo.linear, qubo.coupling))
     quadratic = (edges[:, 0], edges[:, 1], coupling)
     return BinaryQuadraticModel.from_numpy_vectors(linear, quadratic, float(qubo.offset), Vartype.BINARY)
 
@@ -45,6 +45,6 @@ def from_bqm(bqm: BinaryQuadraticModel) -> tuple[Qubo, list[Any]]:
     vectors: Any = bqm.binary.to_numpy_vectors(variable_order=variables)
     linear, (rows, columns, values), offset = vectors
     units = np.arange(len(variables))
-    first, second = (torch.as_tensor(np.concatenate((units, end)).astype(np.int64)) for end in (rows, columns))
-    numbers = torch.as_tensor(np.concatenate((linear, values)).astype(np.float64))
-    return Qubo.from_coo(len(units), first, second, numbers, torch.tensor(float(offset)).double()), variables
+    first, second = (np.concatenate((units, end)).astype(np.int64) for end in (rows, columns))
+    numbers = np.concatenate((linear, values)).astype(np.float64)
+    return Qubo.from_coo(len(units), first, second, numbers, np.array(offset, np.float64)), variables

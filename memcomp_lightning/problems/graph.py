@@ -1,7 +1,7 @@
-"""Which pairs of variables are coupled, and the tensor layout of their couplings.
+"""Which pairs of variables are coupled, and the layout of their couplings.
 
 A coupling is one number a pair. The layouts here let the same equations run on a matrix (RBM) or on a list
-of pairs. ``x`` holds one value a variable, ``(*leading, n)``; per-pair tensors have shape
+of pairs. ``x`` holds one value a variable, ``(*leading, n)``; per-pair arrays have shape
 ``(*leading, *edge_shape)``.
 """
 
@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
+
+from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, namespace
 
 
 class Graph(Protocol):
@@ -26,15 +27,15 @@ class Graph(Protocol):
         """Shape of one number a pair."""
         ...
 
-    def gather(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def gather(self, x: Array) -> tuple[Array, Array]:
         """Values at the first and second variable of each pair, broadcastable to ``edge_shape``."""
         ...
 
-    def scatter(self, first: Tensor, second: Tensor) -> Tensor:
+    def scatter(self, first: Array, second: Array) -> Array:
         """Sum per-pair numbers onto the first and the second variables: ``(*leading, n)``."""
         ...
 
-    def quadratic(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def quadratic(self, coupling: Array, x: Array) -> Array:
         """``sum over pairs of coupling x_first x_second``: ``(*leading, n_states)``.
 
         Args:
@@ -43,12 +44,12 @@ class Graph(Protocol):
         """
         ...
 
-    def field(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def field(self, coupling: Array, x: Array) -> Array:
         """Derivative of :meth:`quadratic` by x: ``(*leading, n_states, n)``."""
         ...
 
-    def alternating(self) -> Tensor:
-        """+1 or -1 for each pair, ``edge_shape``: in which of two ways ``from_qubo`` makes a clause of it.
+    def alternating(self) -> Array:
+        """In which of two ways ``from_qubo`` makes a clause of each pair: +1 or -1, ``edge_shape``, in numpy.
 
         Every variable has about as many of each, so that its unit clauses largely cancel.
         """
@@ -58,8 +59,12 @@ class Graph(Protocol):
         """Slices of variables that are not coupled to each other, in order, covering all."""
         ...
 
-    def edges(self) -> Tensor:
-        """The pairs as ``(n_pairs, 2)``, in the order of a flattened per-pair tensor."""
+    def alike(self, like: AnyArray) -> "Graph":
+        """The same pairs in the library and on the device of ``like``."""
+        ...
+
+    def edges(self) -> Array:
+        """The pairs as ``(n_pairs, 2)``, in the order of a flattened per-pair array."""
         ...
 
 
@@ -84,43 +89,47 @@ class Bipartite:
         """``(n_second, n_first)``."""
         return (self.n_second, self.n_first)
 
-    def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def split(self, x: Array) -> tuple[Array, Array]:
         """The two layers of ``x``."""
         return x[..., : self.n_first], x[..., self.n_first :]
 
-    def gather(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def gather(self, x: Array) -> tuple[Array, Array]:
         """The layers as a row and a column, ready to broadcast."""
         first, second = self.split(x)
-        return first.unsqueeze(-2), second.unsqueeze(-1)
+        return first[..., None, :], second[..., None]
 
-    def scatter(self, first: Tensor, second: Tensor) -> Tensor:
+    def scatter(self, first: Array, second: Array) -> Array:
         """Sum over the columns and over the rows."""
-        return torch.cat((first.sum(-2), second.sum(-1)), dim=-1)
+        return _joined(first.sum(-2), second.sum(-1))
 
-    def quadratic(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def quadratic(self, coupling: Array, x: Array) -> Array:
         """``sum_ij coupling_ij second_i first_j``."""
         first, second = self.split(x)
         return ((second @ coupling) * first).sum(-1)
 
-    def field(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def field(self, coupling: Array, x: Array) -> Array:
         """Couplings times the other layer."""
         first, second = self.split(x)
-        return torch.cat((second @ coupling, first @ coupling.mT), dim=-1)
+        return _joined(second @ coupling, first @ coupling.mT)
 
-    def alternating(self) -> Tensor:
+    def alternating(self) -> Array:
         """+1 between the first halves of both layers and between their second halves."""
-        second, first = (2 * torch.arange(n) >= n for n in (self.n_second, self.n_first))
-        return 1.0 - 2 * (second.unsqueeze(-1) ^ first)
+        second, first = (2 * np.arange(n) >= n for n in (self.n_second, self.n_first))
+        return as_array(1.0 - 2 * (second[:, None] ^ first))
 
     def blocks(self) -> Iterator[slice]:
         """The two layers."""
         yield slice(0, self.n_first)
         yield slice(self.n_first, self.n)
 
-    def edges(self) -> Tensor:
+    def alike(self, like: AnyArray) -> "Bipartite":
+        """Itself: it holds no arrays."""
+        return self
+
+    def edges(self) -> Array:
         """All pairs (first, n_first + second)."""
-        second, first = torch.meshgrid(torch.arange(self.n_second), torch.arange(self.n_first), indexing="ij")
-        return torch.stack((first.flatten(), self.n_first + second.flatten()), dim=-1)
+        second, first = np.divmod(np.arange(self.n_second * self.n_first), self.n_first)
+        return as_array(np.stack((first, self.n_first + second), axis=-1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,41 +142,48 @@ class EdgeList:
     """
 
     n: int
-    pairs: Tensor
+    pairs: Array
 
     @property
     def edge_shape(self) -> tuple[int, ...]:
         """``(n_pairs,)``."""
         return (self.pairs.shape[0],)
 
-    def gather(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def gather(self, x: Array) -> tuple[Array, Array]:
         """Index both ends of every pair."""
         return x[..., self.pairs[:, 0]], x[..., self.pairs[:, 1]]
 
-    def scatter(self, first: Tensor, second: Tensor) -> Tensor:
+    def scatter(self, first: Array, second: Array) -> Array:
         """Add each end's number to its variable."""
-        total = first.new_zeros(*first.shape[:-1], self.n)
-        total.index_add_(-1, self.pairs[:, 0], first)
-        return total.index_add_(-1, self.pairs[:, 1], second)
+        both = namespace(first).concat((first, second), axis=-1)
+        return add_up(both, self.pairs.mT.reshape(-1), self.n)
 
-    def quadratic(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def quadratic(self, coupling: Array, x: Array) -> Array:
         """``sum over pairs of coupling x_first x_second``."""
         first, second = self.gather(x)
-        return (coupling.unsqueeze(-2) * first * second).sum(-1)
+        return (coupling[..., None, :] * first * second).sum(-1)
 
-    def field(self, coupling: Tensor, x: Tensor) -> Tensor:
+    def field(self, coupling: Array, x: Array) -> Array:
         """Couplings times the other end, summed."""
         first, second = self.gather(x)
-        return self.scatter(coupling.unsqueeze(-2) * second, coupling.unsqueeze(-2) * first)
+        return self.scatter(coupling[..., None, :] * second, coupling[..., None, :] * first)
 
-    def alternating(self) -> Tensor:
+    def alternating(self) -> Array:
         """Every other pair of the list."""
-        return 1.0 - 2 * (torch.arange(self.pairs.shape[0], device=self.pairs.device) % 2)
+        return as_array(1.0 - 2 * (np.arange(self.pairs.shape[0]) % 2))
 
     def blocks(self) -> Iterator[slice]:
         """One variable at a time."""
         return (slice(i, i + 1) for i in range(self.n))
 
-    def edges(self) -> Tensor:
+    def alike(self, like: AnyArray) -> "EdgeList":
+        """The same pairs in the library and on the device of ``like``."""
+        return EdgeList(self.n, alike(self.pairs, like))
+
+    def edges(self) -> Array:
         """The pairs."""
         return self.pairs
+
+
+def _joined(first: Array, second: Array) -> Array:
+    return namespace(first).concat((first, second), axis=-1)

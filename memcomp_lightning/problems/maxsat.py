@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, cast, double, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import EdgeList, Graph
 from memcomp_lightning.problems.qubo import Qubo, wide
@@ -22,23 +22,22 @@ class Clauses:
         weight: Clause weights >= 0, ``(*problems, n_clauses)``.
     """
 
-    variables: Tensor
-    polarity: Tensor
-    weight: Tensor
+    variables: Array
+    polarity: Array
+    weight: Array
 
-    def unsatisfied_weight(self, x: Tensor) -> Tensor:
+    def unsatisfied_weight(self, x: Array) -> Array:
         """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, of states in {0, 1}."""
         false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
-        return (false.all(-1).double() @ self.weight.double().unsqueeze(-1)).squeeze(-1)
+        return (double(false.all(-1)) @ double(self.weight)[..., None])[..., 0]
 
-    def field(self, x: Tensor) -> Tensor:
+    def field(self, x: Array) -> Array:
         """Unsatisfied weight of x_i = 1 less that of x_i = 0, ``(*problems, n_states, n)``."""
         false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
         # A literal decides its clause where all others are false.
-        decides = (~false).sum(-1, keepdim=True) == (~false).int()
-        push = -self.polarity.double() * self.weight.double()[..., None, :, None] * decides
-        total = torch.zeros(x.shape, dtype=torch.float64, device=x.device)
-        return total.index_add_(-1, self.variables.flatten(), push.flatten(-2))
+        decides = (~false).sum(-1)[..., None] == ~false
+        push = -double(self.polarity) * double(self.weight)[..., None, :, None] * decides
+        return add_up(push.reshape(*push.shape[:-2], -1), self.variables.reshape(-1), x.shape[-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,11 +58,11 @@ class WeightedMaxSat:
     """
 
     graph: Graph
-    weight: Tensor
-    first: Tensor
-    second: Tensor
-    unit: Tensor
-    offset: Tensor
+    weight: Array
+    first: Array
+    second: Array
+    unit: Array
+    offset: Array
     longer: tuple[Clauses, ...] = ()
 
     @property
@@ -80,37 +79,50 @@ class WeightedMaxSat:
         """The same problem without its clauses of three literals and more."""
         return replace(self, longer=())
 
-    def energy(self, x: Tensor) -> Tensor:
-        """Unsatisfied weight + offset in float64, ``(*problems, n_states)``, of ``x (*problems, n_states, n)``."""
-        return self.unsatisfied_weight(x) + self.offset.double().unsqueeze(-1)
+    def alike(self, like: AnyArray) -> "WeightedMaxSat":
+        """The same problem in the library and on the device of ``like``: a tensor, as to solve it on a GPU."""
+        longer = (
+            Clauses(alike(block.variables, like), alike(block.polarity, like), alike(block.weight, like))
+            for block in self.longer
+        )
+        return WeightedMaxSat(
+            graph=self.graph.alike(like),
+            weight=alike(self.weight, like),
+            first=alike(self.first, like),
+            second=alike(self.second, like),
+            unit=alike(self.unit, like),
+            offset=alike(self.offset, like),
+            longer=tuple(longer),
+        )
 
-    def unsatisfied_weight(self, x: Tensor) -> Tensor:
+    def energy(self, x: Array) -> Array:
+        """Unsatisfied weight + offset in float64, ``(*problems, n_states)``, of ``x (*problems, n_states, n)``."""
+        return self.unsatisfied_weight(x) + double(self.offset)[..., None]
+
+    def unsatisfied_weight(self, x: Array) -> Array:
         """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, by its definition.
 
         Args:
             x: States ``(*problems, n_states, n)`` in {0, 1}.
         """
-        first, second = self.graph.gather(x.double())
-        over_states = -1 - len(self.graph.edge_shape)
+        x, n_axes = alike(x, self.unit), len(self.graph.edge_shape)
         false = [
-            (1 - (2 * value - 1) * polarity.unsqueeze(over_states)) / 2
-            for value, polarity in ((first, self.first), (second, self.second))
+            (1 - (2 * value - 1) * over_states(polarity, n_axes)) / 2
+            for value, polarity in zip(self.graph.gather(double(x)), (self.first, self.second), strict=True)
         ]
-        axes = tuple(range(-len(self.graph.edge_shape), 0))
-        clauses = (self.weight.double().unsqueeze(over_states) * false[0] * false[1]).sum(axes)
-        unit = self.unit.double().unsqueeze(-2)
-        units = (unit.abs() * ((x > 0.5) != (unit > 0))).sum(-1)
+        clauses = (over_states(double(self.weight), n_axes) * false[0] * false[1]).sum(edge_axes(self.graph))
+        unit = double(self.unit)[..., None, :]
+        units = (abs(unit) * ((x > 0.5) != (unit > 0))).sum(-1)
         return clauses + units + sum(block.unsatisfied_weight(x) for block in self.longer)
 
-    def field(self, x: Tensor) -> Tensor:
+    def field(self, x: Array) -> Array:
         """Energy of x_i = 1 less energy of x_i = 0 in float64, ``(*problems, n_states, n)``, of binary states."""
-        first, second = self.graph.gather(2 * x.double() - 1)
-        over_states = -1 - len(self.graph.edge_shape)
-        polarity = [q.double().unsqueeze(over_states) for q in (self.first, self.second)]
-        false = [(1 - q * spin) / 2 for q, spin in zip(polarity, (first, second), strict=True)]
-        weight = self.weight.double().unsqueeze(over_states)
+        n_axes, spins = len(self.graph.edge_shape), self.graph.gather(2 * double(x) - 1)
+        polarity = [over_states(double(q), n_axes) for q in (self.first, self.second)]
+        false = [(1 - q * spin) / 2 for q, spin in zip(polarity, spins, strict=True)]
+        weight = over_states(double(self.weight), n_axes)
         total = self.graph.scatter(-weight * polarity[0] * false[1], -weight * polarity[1] * false[0])
-        total = total - self.unit.double().unsqueeze(-2)
+        total = total - double(self.unit)[..., None, :]
         for block in self.longer:
             total = total + block.field(x)
         return total
@@ -121,7 +133,7 @@ class WeightedMaxSat:
         clauses: Sequence[Sequence[int]],
         weights: Sequence[float | Fraction],
         offset: float | Fraction = 0.0,
-        dtype: torch.dtype = torch.float64,
+        dtype: type[np.float64] | type[np.float32] | type[np.int64] = np.float64,
     ) -> "WeightedMaxSat":
         """Return one problem from literals as in DIMACS: 3 is variable number 3 (the first is 1), -3 its negation.
 
@@ -135,10 +147,10 @@ class WeightedMaxSat:
             clauses: One list of literals a clause.
             weights: One weight >= 0 a clause.
             offset: Added to every energy.
-            dtype: Of the weights; of int64 the offset is an integer, too.
+            dtype: Of the weights, which are numpy arrays; of int64 the offset is an integer, too.
 
         >>> problem = WeightedMaxSat.from_clauses(3, [[1, 2], [-1], [-1, -2, 3]], [1.0, 2.0, 4.0])
-        >>> problem.energy(torch.tensor([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])).tolist()
+        >>> problem.energy(np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])).tolist()
         [6.0, 0.0]
         """
         require(len(clauses) == len(weights), "number of weights", len(weights), f"{len(clauses)}, one a clause")
@@ -164,23 +176,33 @@ class WeightedMaxSat:
             first=pairs.polarity[:, 0],
             second=pairs.polarity[:, 1],
             unit=_vector([one - zero for zero, one in for_0_and_1], dtype),
-            offset=_vector([offset + always], dtype if not dtype.is_floating_point else torch.float64)[0],
+            offset=_vector([offset + always], np.int64 if dtype is np.int64 else np.float64)[0],
             longer=tuple(_literal_block(length, *by_length[length], dtype) for length in sorted(by_length)),
         )
 
 
-def _vector(numbers: Sequence[float | Fraction], dtype: torch.dtype) -> Tensor:
-    """Numbers as a tensor, each rounded once; integers stay what they are."""
-    return torch.tensor([float(x) if dtype.is_floating_point else int(x) for x in numbers], dtype=dtype)
+def _vector(numbers: Sequence[float | Fraction], dtype: type[np.generic]) -> Array:
+    """Numbers as an array, each rounded once; integers stay what they are."""
+    return as_array(np.array([int(x) if dtype is np.int64 else float(x) for x in numbers], dtype))
 
 
 def _literal_block(
-    length: int, clauses: list[list[int]], weights: list[float | Fraction], dtype: torch.dtype
+    length: int, clauses: list[list[int]], weights: list[float | Fraction], dtype: type[np.generic]
 ) -> Clauses:
-    """Clauses of one length as tensors."""
-    literals = torch.tensor(clauses, dtype=torch.int64).reshape(len(clauses), length)
-    weight = _vector(weights, dtype)
-    return Clauses(variables=literals.abs() - 1, polarity=literals.sign().to(weight.dtype), weight=weight)
+    """Clauses of one length as arrays."""
+    literals = np.array(clauses, np.int64).reshape(len(clauses), length)
+    polarity = np.sign(literals).astype(dtype)
+    return Clauses(as_array(np.abs(literals) - 1), as_array(polarity), _vector(weights, dtype))
+
+
+def edge_axes(graph: Graph) -> tuple[int, ...]:
+    """The axes of one number a pair, counted from the last."""
+    return tuple(range(-len(graph.edge_shape), 0))
+
+
+def over_states(x: Array, n_axes: int) -> Array:
+    """``x`` with an axis of size 1 for the states, before its last ``n_axes`` axes."""
+    return x[..., *(None, *(slice(None),) * n_axes)]
 
 
 def from_qubo(qubo: Qubo) -> WeightedMaxSat:
@@ -195,14 +217,14 @@ def from_qubo(qubo: Qubo) -> WeightedMaxSat:
     its field in the spin form and no unit clause outweighs the clauses that oppose it. The unit weights add up
     with the linear terms; the sign of the sum u picks the literal, and the unsatisfied weight is max(u, 0) - u x.
     """
-    way = qubo.graph.alternating().to(qubo.coupling)
-    weight = qubo.coupling.abs()
-    second = -way.expand(weight.shape)
-    first = torch.where(qubo.coupling < 0, -second, second)
+    xp, weight = namespace(qubo.coupling), abs(qubo.coupling)
+    way = cast(alike(qubo.graph.alternating(), weight), weight.dtype)
+    second = -xp.broadcast_to(way, weight.shape)
+    first = xp.where(qubo.coupling < 0, -second, second)
     # A literal of polarity q is false as (1 + q) / 2 - q x: what a clause costs beyond J x_i x_j is linear.
     false_first, false_second = (1 + first) / 2, (1 + second) / 2
     linear = qubo.graph.scatter(-weight * first * false_second, -weight * second * false_first)
-    constant = (weight * false_first * false_second).double().sum(tuple(range(-len(qubo.graph.edge_shape), 0)))
+    constant = double(weight * false_first * false_second).sum(edge_axes(qubo.graph))
     unit = linear - qubo.linear
     return WeightedMaxSat(
         graph=qubo.graph,
@@ -210,7 +232,7 @@ def from_qubo(qubo: Qubo) -> WeightedMaxSat:
         first=first,
         second=second,
         unit=unit,
-        offset=qubo.offset.double() - constant - unit.double().clamp(min=0).sum(-1),
+        offset=double(qubo.offset) - constant - double(unit).clip(min=0).sum(-1),
     )
 
 
@@ -230,15 +252,14 @@ def to_qubo(maxsat: WeightedMaxSat) -> Qubo:
         "at most 2 literals",
         "Longer clauses are no QUBO without auxiliary variables: solve them with DmmSolver(field=ClauseField()).",
     )
-    axes = tuple(range(-len(maxsat.graph.edge_shape), 0))
     constant_first, constant_second = (1 + maxsat.first) // 2, (1 + maxsat.second) // 2
     linear = maxsat.graph.scatter(
         -maxsat.weight * maxsat.first * constant_second, -maxsat.weight * maxsat.second * constant_first
     )
-    constant = wide(maxsat.weight * constant_first * constant_second).sum(axes)
+    constant = wide(maxsat.weight * constant_first * constant_second).sum(edge_axes(maxsat.graph))
     return Qubo(
         graph=maxsat.graph,
         coupling=maxsat.weight * maxsat.first * maxsat.second,
         linear=linear - maxsat.unit,
-        offset=maxsat.offset + constant + wide(maxsat.unit).clamp(min=0).sum(-1),
+        offset=maxsat.offset + constant + wide(maxsat.unit).clip(min=0).sum(-1),
     )

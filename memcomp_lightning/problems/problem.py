@@ -4,10 +4,12 @@ import difflib
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
+from memcomp_lightning.arrays import Array, to_numpy
 from memcomp_lightning.errors import require, require_choice
 from memcomp_lightning.problems.files.formats import FORMATS, guess
 from memcomp_lightning.problems.files.objective import ClauseList, Objective, Score
@@ -38,7 +40,7 @@ class Problem:
     format: str
     objective: Objective
     n: int
-    variables: Tensor
+    variables: NDArray[np.int64]
     remarks: tuple[str, ...] = ()
     integers: Qubo | None = None
     resolved: bool = True
@@ -62,11 +64,14 @@ class Problem:
         """Number of variables that the file does not use: any value of theirs does."""
         return self.n - self.problem.n
 
-    def expand(self, x: Tensor) -> Tensor:
+    def expand(self, x: Array) -> NDArray[Any]:
         """A state of the problem's variables ``(n_used,)`` as one of the file's ``(n,)``; unused ones are 0."""
-        return x.new_zeros(self.n).index_copy(0, self.variables.to(x.device), x)
+        state = to_numpy(x)
+        whole = np.zeros(self.n, state.dtype)
+        whole[self.variables] = state
+        return whole
 
-    def score(self, x: Tensor) -> Score:
+    def score(self, x: Array) -> Score:
         """Count as the file's authors do, without rounding.
 
         Args:
@@ -74,8 +79,8 @@ class Problem:
         """
         sizes = f"({self.n},)" + (f" or ({self.problem.n},)" if self.n_unused else "")
         require(tuple(x.shape) in ((self.n,), (self.problem.n,)), "shape of x", tuple(x.shape), sizes)
-        used = x[self.variables.to(x.device)] if len(x) == self.n else x
-        return self.objective.counting.count((used > 0.5).cpu().numpy())
+        state = to_numpy(x) > 0.5
+        return self.objective.counting.count(state[self.variables] if len(state) == self.n else state)
 
 
 def read_problem(path: str | Path, format: str | None = None, *, maximise: bool = False) -> Problem:
@@ -112,7 +117,7 @@ def read_problem(path: str | Path, format: str | None = None, *, maximise: bool 
         format=name,
         objective=parsed.objective,
         n=parsed.n,
-        variables=torch.from_numpy(parsed.variables),
+        variables=parsed.variables,
         remarks=parsed.remarks,
         integers=parsed.integers,
         resolved=parsed.resolved,

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
+from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, cast, double, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import EdgeList, Graph
 
@@ -13,7 +11,8 @@ from memcomp_lightning.problems.graph import EdgeList, Graph
 class Qubo:
     r"""Minimise ``offset + linear . x + \sum_{pairs} coupling x_i x_j`` over x in {0, 1}^n.
 
-    Leading axes ``*problems`` hold independent problems of one graph. Numbers of int64 are added up as integers:
+    Its numbers are numpy arrays or torch tensors, and so are the solvers' answers. Leading axes ``*problems`` hold
+    independent problems of one graph. Numbers of int64 are added up as integers:
     ``BruteForce`` compares their sums without rounding.
 
     Attributes:
@@ -24,9 +23,9 @@ class Qubo:
     """
 
     graph: Graph
-    coupling: Tensor
-    linear: Tensor
-    offset: Tensor
+    coupling: Array
+    linear: Array
+    offset: Array
 
     def __post_init__(self) -> None:
         edge_shape, n = self.graph.edge_shape, self.graph.n
@@ -45,8 +44,9 @@ class Qubo:
             f"{(*problems, n)}",
         )
         require(tuple(self.offset.shape) == problems, "offset shape", tuple(self.offset.shape), f"{problems}")
-        for name, tensor in (("coupling", self.coupling), ("linear", self.linear), ("offset", self.offset)):
-            require(bool(tensor.isfinite().all()), name, "a tensor with NaN or infinite entries", "finite numbers")
+        isfinite = namespace(self.linear).isfinite
+        for name, numbers in (("coupling", self.coupling), ("linear", self.linear), ("offset", self.offset)):
+            require(bool(isfinite(numbers).all()), name, "an array with NaN or infinite entries", "finite numbers")
 
     @property
     def n(self) -> int:
@@ -60,59 +60,72 @@ class Qubo:
 
     def double(self) -> "Qubo":
         """The same problem in float64."""
-        return Qubo(self.graph, self.coupling.double(), self.linear.double(), self.offset.double())
+        return Qubo(self.graph, double(self.coupling), double(self.linear), double(self.offset))
 
-    def energy(self, x: Tensor) -> Tensor:
+    def alike(self, like: AnyArray) -> "Qubo":
+        """The same problem in the library and on the device of ``like``: a tensor, as to solve it on a GPU."""
+        numbers = (alike(part, like) for part in (self.coupling, self.linear, self.offset))
+        return Qubo(self.graph.alike(like), *numbers)
+
+    def energy(self, x: Array) -> Array:
         """Energy in float64, ``(*problems, n_states)``, of states ``x (*problems, n_states, n)`` in [0, 1].
 
         Of a problem in int64 the energy is an integer, and the states are in {0, 1}.
         """
         linear, coupling, offset = wide(self.linear), wide(self.coupling), wide(self.offset)
-        x = x.to(linear.dtype)
-        own = (x @ linear.unsqueeze(-1)).squeeze(-1)
-        return offset.unsqueeze(-1) + own + self.graph.quadratic(coupling, x)
+        x = cast(alike(x, linear), linear.dtype)
+        own = (x @ linear[..., None])[..., 0]
+        return offset[..., None] + own + self.graph.quadratic(coupling, x)
 
-    def rounds(self) -> Tensor:
+    def rounds(self) -> Array:
         """Whether the numbers are integers with sums beyond 2^53, which float64 rounds: ``(*problems,)`` bool."""
-        if self.linear.dtype == torch.int64:
-            return torch.zeros(self.problems, dtype=torch.bool, device=self.linear.device)
-        parts = [self.coupling.reshape(*self.problems, -1), self.linear, self.offset.unsqueeze(-1)]
-        numbers = torch.cat([part.double() for part in parts], dim=-1)
-        return (numbers == numbers.round()).all(-1) & (numbers.abs().sum(-1) > 2.0**53)
+        xp = namespace(self.linear)
+        if self.linear.dtype == xp.int64:
+            return xp.zeros_like(self.offset, dtype=xp.bool)
+        parts = [self.coupling.reshape(*self.problems, -1), self.linear, self.offset[..., None]]
+        numbers = xp.concat([double(part) for part in parts], axis=-1)
+        return (numbers == xp.round(numbers)).all(-1) & (abs(numbers).sum(-1) > 2.0**53)
 
-    def field(self, x: Tensor) -> Tensor:
+    def field(self, x: Array) -> Array:
         """Energy of x_i = 1 less energy of x_i = 0 for each variable, ``(*problems, n_states, n)``."""
-        return self.linear.unsqueeze(-2) + self.graph.field(self.coupling, x)
+        return self.linear[..., None, :] + self.graph.field(self.coupling, x)
 
     @staticmethod
-    def from_matrix(matrix: Tensor, offset: Tensor | None = None) -> "Qubo":
+    def from_matrix(matrix: AnyArray, offset: AnyArray | None = None) -> "Qubo":
         """Return the problem ``x' Q x + offset`` of a square matrix, symmetric or not.
 
         Args:
             matrix: ``(*problems, n, n)``; entries (i, j) and (j, i) add up, the diagonal is the linear part.
-                One problem may also be a sparse torch tensor (COO, CSR, CSC).
+                One problem may also be sparse, of scipy or torch.
             offset: ``(*problems,)``; None is zero.
 
-        >>> Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]])).energy(torch.ones(1, 2)).tolist()
+        >>> import numpy as np
+        >>> Qubo.from_matrix(np.array([[1.0, -3.0], [0.0, 1.0]])).energy(np.ones((1, 2))).tolist()
         [-1.0]
         """
-        n = matrix.shape[-1]
+        n, matrix = matrix.shape[-1], as_array(matrix)
         require(
             matrix.ndim >= 2 and matrix.shape[-2] == n,
             "matrix shape",
             tuple(matrix.shape),
             "(*problems, n, n)",
         )
-        if matrix.layout != torch.strided:
+        if hasattr(matrix, "tocoo"):
+            coo = matrix.tocoo()
+            rows, columns = (index.astype("int64") for index in (coo.row, coo.col))
+            return Qubo.from_coo(n, rows, columns, coo.data, offset)
+        if "sparse" in str(getattr(matrix, "layout", "")):
             require(matrix.ndim == 2, "sparse matrix shape", tuple(matrix.shape), "(n, n), one problem")
             coo = matrix.to_sparse_coo().coalesce()
             return Qubo.from_coo(n, coo.indices()[0], coo.indices()[1], coo.values(), offset)
         used = (matrix != 0).reshape(-1, n, n).any(0)
-        rows, columns = used.nonzero(as_tuple=True)
+        rows, columns = namespace(matrix).nonzero(used)
         return Qubo.from_coo(n, rows, columns, matrix[..., rows, columns], offset)
 
     @staticmethod
-    def from_coo(n: int, rows: Tensor, columns: Tensor, values: Tensor, offset: Tensor | None = None) -> "Qubo":
+    def from_coo(
+        n: int, rows: AnyArray, columns: AnyArray, values: AnyArray, offset: AnyArray | None = None
+    ) -> "Qubo":
         """Return the problem ``sum_k value_k x_row_k x_column_k + offset`` with memory linear in the entries.
 
         Args:
@@ -122,40 +135,39 @@ class Qubo:
             values: ``(*problems, n_entries)``; entries of the same pair, in either order, add up.
             offset: ``(*problems,)``; None is zero.
 
-        >>> edges = torch.tensor([0, 1, 1]), torch.tensor([1, 0, 1])
-        >>> Qubo.from_coo(2, *edges, torch.tensor([-1.0, -2.0, 1.0])).energy(torch.ones(1, 2)).tolist()
+        >>> import numpy as np
+        >>> edges = np.array([0, 1, 1]), np.array([1, 0, 1])
+        >>> Qubo.from_coo(2, *edges, np.array([-1.0, -2.0, 1.0])).energy(np.ones((1, 2))).tolist()
         [-2.0]
         """
+        rows, columns, values = as_array(rows), as_array(columns), as_array(values)
         for name, index in (("rows", rows), ("columns", columns)):
             require(
                 index.shape == values.shape[-1:] and bool(((index >= 0) & (index < n)).all()),
                 name,
-                f"shape {tuple(index.shape)}, from {index.min() if index.numel() else '-'} "
-                f"to {index.max() if index.numel() else '-'}",
+                f"shape {tuple(index.shape)}, from {index.min() if len(index) else '-'} "
+                f"to {index.max() if len(index) else '-'}",
                 f"{values.shape[-1]} integers, one a value, from 0 to n - 1 = {n - 1}",
             )
-        diagonal = rows == columns
-        problems = values.shape[:-1]
-        linear = values.new_zeros(*problems, n).index_add_(-1, rows[diagonal], values[..., diagonal])
-        first, second = torch.minimum(rows, columns)[~diagonal], torch.maximum(rows, columns)[~diagonal]
-        keys, position = (first * n + second).unique(return_inverse=True)
-        coupling = values.new_zeros(*problems, keys.shape[0]).index_add_(-1, position, values[..., ~diagonal])
+        xp, diagonal = namespace(values), rows == columns
+        first, second = xp.minimum(rows, columns)[~diagonal], xp.maximum(rows, columns)[~diagonal]
+        keys, position = xp.unique_inverse(first * n + second)
         return Qubo(
-            graph=EdgeList(n=n, pairs=torch.stack((keys // n, keys % n), dim=-1)),
-            coupling=coupling,
-            linear=linear,
-            offset=values.new_zeros(problems) if offset is None else offset,
+            graph=EdgeList(n=n, pairs=xp.stack((keys // n, keys % n), axis=-1)),
+            coupling=add_up(values[..., ~diagonal], position, len(keys)),
+            linear=add_up(values[..., diagonal], rows[diagonal], n),
+            offset=xp.zeros_like(values.sum(-1)) if offset is None else as_array(offset),
         )
 
-    def to_matrix(self) -> Tensor:
+    def to_matrix(self) -> Array:
         """The upper triangular matrix Q of ``x' Q x + offset``, ``(*problems, n, n)``."""
-        matrix = torch.diag_embed(self.linear)
-        edges = self.graph.edges().to(self.linear.device)
-        flat = self.coupling.reshape(*self.problems, -1)
-        matrix[..., edges[:, 0], edges[:, 1]] += flat
+        xp = namespace(self.linear)
+        edges = alike(self.graph.edges(), self.linear)
+        matrix = self.linear[..., None] * xp.eye(self.n, dtype=self.linear.dtype, device=self.linear.device)
+        matrix[..., edges[:, 0], edges[:, 1]] += self.coupling.reshape(*self.problems, -1)
         return matrix
 
 
-def wide(x: Tensor) -> Tensor:
+def wide(x: Array) -> Array:
     """In float64, or int64 as it is."""
-    return x if x.dtype == torch.int64 else x.double()
+    return x if x.dtype == namespace(x).int64 else double(x)

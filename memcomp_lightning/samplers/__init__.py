@@ -6,6 +6,7 @@ from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.exact import Exact
 from memcomp_lightning.samplers.ground_state import GroundState
 from memcomp_lightning.samplers.mode_assisted import ModeAssisted, ModeSchedule
+from memcomp_lightning.samplers.parallel_tempering import ParallelTempering
 from memcomp_lightning.samplers.pcd import PCD
 from memcomp_lightning.samplers.positive import (
     ClampedGibbs,
@@ -15,7 +16,6 @@ from memcomp_lightning.samplers.positive import (
     PositivePhaseSampler,
 )
 from memcomp_lightning.samplers.quench import Quench
-from memcomp_lightning.samplers.tempering import ParallelTempering
 
 __all__ = [
     "CD",

@@ -2,14 +2,16 @@
 
 import time
 from dataclasses import dataclass
-
-import torch
-from torch import Generator, Tensor
+from typing import TYPE_CHECKING
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import Array, cast, namespace
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -30,21 +32,20 @@ class AlternatingDescent:
         require_count("n_restarts", self.n_restarts)
         require_count("max_sweeps", self.max_sweeps)
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return one local minimum a start."""
-        begin = time.perf_counter()
-        shape = (*qubo.problems, self.n_restarts, qubo.n)
-        x = (rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5).to(qubo.linear.dtype)
-        steps = torch.zeros(shape[:-1], dtype=torch.int64, device=x.device)
-        moving = torch.ones(shape[:-1], dtype=torch.bool, device=x.device)
+        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        x = random_states(qubo, self.n_restarts, generator)
+        moving = xp.ones(x.shape[:-1], dtype=xp.bool, device=x.device)
+        steps = xp.zeros(x.shape[:-1], dtype=xp.int64, device=x.device)
         for _ in range(self.max_sweeps):
-            before = x.clone()
+            before = xp.asarray(x, copy=True)
             descend(qubo, x)
             steps += moving
             moving = (x != before).any(-1)
             if not bool(moving.any()):
                 break
-        status = torch.where(moving, int(Status.STEP_BUDGET), int(Status.CONVERGED))
+        status = xp.where(moving, int(Status.STEP_BUDGET), int(Status.CONVERGED))
         return QuboSolution(
             assignments=x,
             energies=qubo.energy(x),
@@ -54,9 +55,15 @@ class AlternatingDescent:
         )
 
 
-def descend(qubo: Qubo, x: Tensor) -> None:
+def random_states(qubo: Qubo, n_restarts: int, generator: "Generator") -> Array:
+    """Independent states ``(*problems, n_restarts, n)`` in {0, 1}, each as likely as any other."""
+    shape = (*qubo.problems, n_restarts, qubo.n)
+    return cast(rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5, qubo.linear.dtype)
+
+
+def descend(qubo: Qubo, x: Array) -> None:
     """Set each block of ``x`` in turn to its optimum given the rest, in place."""
     for block in qubo.graph.blocks():
         field = qubo.field(x)[..., block]
         # A tie keeps its value, so that equal energies cannot alternate for ever.
-        x[..., block] = torch.where(field == 0, x[..., block], (field < 0).to(x.dtype))
+        x[..., block] = namespace(x).where(field == 0, x[..., block], cast(field < 0, x.dtype))

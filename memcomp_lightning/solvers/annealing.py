@@ -2,15 +2,19 @@
 
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Generator, Tensor
+import numpy as np
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import Array, cast, double, namespace, sigmoid
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
-from memcomp_lightning.solvers.alternating_descent import descend
+from memcomp_lightning.solvers.alternating_descent import descend, random_states
 from memcomp_lightning.solvers.base import QuboSolution, Status
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,22 +44,20 @@ class GibbsAnnealing:
         allowed = f"a number >= beta_first = {self.beta_first}"
         require(self.beta_last >= self.beta_first, "beta_last", self.beta_last, allowed)
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the end of each restart."""
-        begin = time.perf_counter()
-        shape = (*qubo.problems, self.n_restarts, qubo.n)
-        x = (rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5).to(qubo.linear.dtype)
+        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        x = random_states(qubo, self.n_restarts, generator)
         blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
         growth = self.beta_last / self.beta_first
-        per_scale = torch.logspace(0, 1, self.n_sweeps, base=growth, dtype=torch.float64, device="cpu")
-        for beta in (self.beta_first * per_scale).tolist():
-            beta_here = (beta / scale).to(x.dtype)[..., None, None]
+        for beta in (self.beta_first * np.logspace(0, 1, self.n_sweeps, base=growth)).tolist():
+            beta_here = cast(beta / scale, x.dtype)[..., None, None]
             for block in blocks:
-                p = torch.sigmoid(-beta_here * qubo.field(x)[..., block])
+                p = sigmoid(-beta_here * qubo.field(x)[..., block])
                 x[..., block] = rng.bernoulli(p, generator=generator)
         for _ in range(_DESCENTS):
             descend(qubo, x)
-        ones = torch.ones(shape[:-1], dtype=torch.int64, device=x.device)
+        ones = xp.ones(x.shape[:-1], dtype=xp.int64, device=x.device)
         return QuboSolution(
             assignments=x,
             energies=qubo.energy(x),
@@ -69,9 +71,8 @@ _DESCENTS = 3
 """Sweeps at zero temperature that close."""
 
 
-def _scale(qubo: Qubo) -> Tensor:
+def _scale(qubo: Qubo) -> Array:
     """Root mean square over the variables of the norm of their spin couplings, ``(*problems,)``."""
-    power = (qubo.coupling.double() / 4).square()
-    per_variable = qubo.graph.scatter(power, power)
-    scale = per_variable.mean(-1).sqrt()
-    return torch.where(scale > 0, scale, 1)
+    power = (double(qubo.coupling) / 4) ** 2
+    scale = qubo.graph.scatter(power, power).mean(-1) ** 0.5
+    return namespace(scale).where(scale > 0, scale, 1.0)

@@ -8,10 +8,11 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from memcomp_lightning import __version__
+from memcomp_lightning.arrays import namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
 from memcomp_lightning.problems.files.numbers import Exact, in_full
@@ -34,7 +35,7 @@ class Answer:
             that rests on rounded sums ROUNDED.
     """
 
-    assignment: Tensor
+    assignment: NDArray[np.bool_]
     score: Score
     energy: Exact | float
     energies: list[Exact | float | None]
@@ -68,7 +69,7 @@ class Answer:
         """
         require(solution.energies.ndim == 1, "energies' shape", tuple(solution.energies.shape), "(n_restarts,)")
         # Solvers return the dtype of what they were given: integers were compared as integers.
-        exact = problem.resolved or solution.assignments.dtype == torch.int64
+        exact = problem.resolved or solution.assignments.dtype == namespace(solution.assignments).int64
         scores: list[Score | None] = []
         status: list[Status] = []
         for x, energy, code in zip(
@@ -144,8 +145,8 @@ def write_solution(
 
 def _json(value: object) -> str:
     """A value as JSON; an assignment digit by digit, as it may have millions."""
-    if isinstance(value, Tensor):
-        return f"[{', '.join(map(str, value.to(torch.uint8).tolist()))}]"
+    if isinstance(value, np.ndarray):
+        return f"[{', '.join(map(str, value.astype(int).tolist()))}]"
     return json.dumps(value, allow_nan=False)
 
 

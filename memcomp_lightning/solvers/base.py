@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from torch import Generator, Tensor
+import numpy as np
 
+from memcomp_lightning.arrays import Array, namespace, to_numpy
 from memcomp_lightning.problems.qubo import Qubo
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 
 class Status(IntEnum):
@@ -43,18 +47,18 @@ class RecordedStates(Protocol):
     """States that a solver passed through, as samples of low energy."""
 
     @property
-    def assignments(self) -> Tensor:
+    def assignments(self) -> Array:
         """``(*problems, n_restarts, n_records, n)``, bool."""
         ...
 
-    def weights(self) -> Tensor:
+    def weights(self) -> Array:
         """How much each of them counts in an average, >= 0, ``(*problems, n_restarts, n_records)``."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuboSolution:
-    """Answers of all restarts.
+    """Answers of all restarts, as arrays of the library that the problem's numbers are of.
 
     Attributes:
         assignments: ``(*problems, n_restarts, n)`` in {0, 1}, dtype of the problem.
@@ -65,27 +69,28 @@ class QuboSolution:
         trajectory: What the solver passed through, if it was asked to record it.
     """
 
-    assignments: Tensor
-    energies: Tensor
-    status: Tensor
-    steps: Tensor
+    assignments: Array
+    energies: Array
+    status: Array
+    steps: Array
     wall_time_s: float
     trajectory: RecordedStates | None = None
 
     @property
-    def best_energy(self) -> Tensor:
+    def best_energy(self) -> Array:
         """Lowest energy over the restarts, ``(*problems,)`` float64."""
-        return self.energies.min(-1).values
+        return namespace(self.energies).min(self.energies, axis=-1)
 
     @property
-    def best(self) -> Tensor:
+    def best(self) -> Array:
         """Assignment of lowest energy, ``(*problems, n)``."""
-        index = self.energies.argmin(-1)[..., None, None]
-        return self.assignments.take_along_dim(index, dim=-2).squeeze(-2)
+        xp, index = namespace(self.energies), self.energies.argmin(-1)[..., None, None]
+        index = xp.broadcast_to(index, (*index.shape[:-1], self.assignments.shape[-1]))
+        return xp.take_along_axis(self.assignments, index, axis=-2)[..., 0, :]
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""
-        values, counts = self.status.unique(return_counts=True)
+        values, counts = np.unique(to_numpy(self.status), return_counts=True)
         return {
             f"{Status(int(value)).name}: {Status(int(value)).advice}": int(count)
             for value, count in zip(values, counts, strict=True)
@@ -98,6 +103,11 @@ class QuboSolver(Protocol):
     A solver that stops early says so in ``status``; it does not raise inside a training run.
     """
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
-        """Return the assignments found, one a restart."""
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
+        """Return the assignments found, one a restart.
+
+        Args:
+            qubo: One or many problems of one graph.
+            generator: The source of random numbers, of numpy or torch, whatever the problem is made of.
+        """
         ...

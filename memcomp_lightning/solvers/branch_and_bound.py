@@ -2,18 +2,21 @@
 
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Generator
 
 from memcomp_lightning import compiling
+from memcomp_lightning.arrays import alike, cast, to_numpy
 from memcomp_lightning.errors import SettingError, require_count
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import AlternatingDescent
 from memcomp_lightning.solvers.base import QuboSolution, Status
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -35,7 +38,7 @@ class BranchAndBound:
     def __post_init__(self) -> None:
         require_count("max_nodes", self.max_nodes)
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return one assignment for each problem, OPTIMAL where it is proven up to the rounding of float64.
 
         For integers whose sums float64 holds, the proof is exact; where it rounds the sums, the status is ROUNDED.
@@ -55,10 +58,10 @@ class BranchAndBound:
                 "(Bipartite). Use BruteForce or a heuristic (DmmSolver)."
             )
         known = AlternatingDescent().minimise(qubo, generator=generator)
-        incumbent = (known.best_energy - qubo.offset.double()).flatten().tolist()
-        best = known.best.reshape(-1, qubo.n).cpu()
-        coupling = qubo.coupling.reshape(-1, graph.n_second, graph.n_first).cpu().double().numpy()
-        linear = qubo.linear.reshape(-1, qubo.n).cpu().double().numpy()
+        incumbent = to_numpy(known.best_energy - qubo.offset).ravel().tolist()
+        best = to_numpy(known.best).reshape(-1, qubo.n).copy()
+        coupling = to_numpy(qubo.coupling).reshape(-1, graph.n_second, graph.n_first).astype(np.float64)
+        linear = to_numpy(qubo.linear).reshape(-1, qubo.n).astype(np.float64)
         status, nodes = [], []
         for p, energy in enumerate(incumbent):
             weight, own, other = coupling[p].T, *np.split(linear[p], [graph.n_first])
@@ -74,16 +77,16 @@ class BranchAndBound:
                 smaller, larger = np.empty(len(order)), other + state @ weight < 0
                 smaller[order] = state
                 layers = (larger, smaller) if second_is_smaller else (smaller, larger)
-                best[p] = torch.from_numpy(np.concatenate(layers))
+                best[p] = np.concatenate(layers)
             status.append(int(complete if proven else Status.STEP_BUDGET))
             nodes.append(n_nodes)
-        assignments = best.reshape(*qubo.problems, 1, qubo.n).to(qubo.linear)
+        assignments = cast(alike(best.reshape(*qubo.problems, 1, qubo.n), qubo.linear), qubo.linear.dtype)
         each = (*qubo.problems, 1)
         return QuboSolution(
             assignments=assignments,
             energies=qubo.energy(assignments),
-            status=torch.tensor(status, device=assignments.device).reshape(each),
-            steps=torch.tensor(nodes, device=assignments.device).reshape(each),
+            status=alike(np.reshape(status, each), assignments),
+            steps=alike(np.reshape(nodes, each), assignments),
             wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
         )
 

@@ -1,20 +1,24 @@
 """The exact minimum, by enumeration."""
 
+import math
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
 
+from memcomp_lightning.arrays import Array, cast, double, namespace
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
 
-_NUMBERS = 2**22
-"""Numbers held at a time."""
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
+
+_NUMBERS = 2**18
+"""Numbers held at a time: they stay in a processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -36,7 +40,7 @@ class BruteForce:
         require_count("max_variables", self.max_variables)
         require_count("chunk_size", self.chunk_size)
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the minimum as a single restart; the generator is not used.
 
         Energies of an int64 problem are compared as integers. Of other problems the status is ROUNDED where the
@@ -45,9 +49,9 @@ class BruteForce:
         Raises:
             SettingError: More variables to enumerate than ``max_variables``.
         """
-        begin = time.perf_counter()
-        graph = qubo.graph
-        exact = qubo.linear.dtype == torch.int64
+        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        graph, device = qubo.graph, qubo.linear.device
+        exact = qubo.linear.dtype == xp.int64
         layered = isinstance(graph, Bipartite) and not exact
         enumerated = min(graph.n_first, graph.n_second) if isinstance(graph, Bipartite) and layered else qubo.n
         require(
@@ -57,29 +61,28 @@ class BruteForce:
             f"at most max_variables = {self.max_variables}",
             "Use a heuristic (DmmSolver, AlternatingDescent), or raise max_variables: each one doubles the time.",
         )
-        worst = torch.iinfo(torch.int64).max if exact else torch.inf
-        best_energy = torch.full(
-            qubo.problems, worst, dtype=torch.int64 if exact else torch.float64, device=qubo.linear.device
-        )
-        best = qubo.linear.new_zeros(*qubo.problems, enumerated, dtype=torch.float64 if exact else None)
+        worst, of_energies = (2**63 - 1, xp.int64) if exact else (xp.inf, xp.float64)
+        best_energy = xp.full(qubo.problems, worst, dtype=of_energies, device=device)
+        of_states = xp.float64 if exact else qubo.linear.dtype
+        best = xp.zeros((*qubo.problems, enumerated), dtype=of_states, device=device)
         layers = _Layers(qubo) if layered else None
-        at_once = max(1, min(self.chunk_size, _NUMBERS // max(qubo.linear.numel(), 1)))
+        at_once = max(1, min(self.chunk_size, _NUMBERS // max(math.prod(qubo.linear.shape), 1)))
         for start in range(0, 2**enumerated, at_once):
             stop = min(start + at_once, 2**enumerated)
-            states = binary_states(enumerated, start=start, stop=stop, like=best).to(qubo.linear.dtype)
-            every = states.expand(*qubo.problems, *states.shape)
-            energies, index = (qubo.energy(every) if layers is None else layers.lowest(states)).min(-1)
-            best = torch.where((energies < best_energy).unsqueeze(-1), states[index].to(best.dtype), best)
-            best_energy = torch.minimum(energies, best_energy)
+            states = cast(binary_states(enumerated, start=start, stop=stop, like=best), qubo.linear.dtype)
+            every = xp.broadcast_to(states, (*qubo.problems, *states.shape))
+            energies = qubo.energy(every) if layers is None else layers.lowest(states)
+            index, lowest = energies.argmin(-1), xp.min(energies, axis=-1)
+            best = xp.where((lowest < best_energy)[..., None], cast(states[index], of_states), best)
+            best_energy = xp.minimum(lowest, best_energy)
         if layers is not None:
             best = layers.completed(best)
-        assignments = best.unsqueeze(-2).to(qubo.linear.dtype)
-        one_each = torch.ones(*qubo.problems, 1, dtype=torch.int64, device=best.device)
+        assignments = cast(best[..., None, :], qubo.linear.dtype)
         return QuboSolution(
             assignments=assignments,
-            energies=qubo.energy(assignments).double(),
-            status=torch.where(qubo.rounds().unsqueeze(-1), int(Status.ROUNDED), int(Status.OPTIMAL)),
-            steps=one_each * 2**enumerated,
+            energies=double(qubo.energy(assignments)),
+            status=xp.where(qubo.rounds()[..., None], int(Status.ROUNDED), int(Status.OPTIMAL)),
+            steps=xp.full((*qubo.problems, 1), 2**enumerated, dtype=xp.int64, device=device),
             wall_time_s=time.perf_counter() - begin,
         )
 
@@ -91,23 +94,25 @@ class _Layers:
         graph = qubo.graph
         assert isinstance(graph, Bipartite)
         self._first = graph.n_first <= graph.n_second
-        layers = qubo.linear.double().split((graph.n_first, graph.n_second), dim=-1)
+        layers = graph.split(double(qubo.linear))
         self._linear, self._other = layers if self._first else layers[::-1]
-        self._coupling = qubo.coupling.double().mT if self._first else qubo.coupling.double()
-        self._offset = qubo.offset.double()
+        self._coupling = double(qubo.coupling).mT if self._first else double(qubo.coupling)
+        self._offset = double(qubo.offset)
 
-    def lowest(self, states: Float[Tensor, "states n"]) -> Float[Tensor, "*problems states"]:
+    def lowest(self, states: Float[Array, "states n"]) -> Float[Array, "*problems states"]:
         """Energy of each state of the smaller layer with the best state of the other."""
-        states = states.double()
+        states, n, xp = double(states), len(states), namespace(states)
         # One product for all problems: (states, n) times (n, problems and units).
-        flat = self._coupling.movedim(-2, 0).flatten(1)
-        field = torch.addmm(self._other.flatten(), states, flat).view(len(states), *self._other.shape)
-        own = states @ self._linear.reshape(-1, states.shape[-1]).mT
-        energy: Tensor = field.clamp_(max=0.0).sum(-1) + own.view(len(states), *self._offset.shape) + self._offset
-        return energy.movedim(0, -1)
+        flat = xp.moveaxis(self._coupling, -2, 0).reshape(states.shape[-1], -1)
+        field = (states @ flat).reshape(n, *self._other.shape)
+        field += self._other
+        zero = xp.zeros((), dtype=xp.float64, device=field.device)
+        own = (states @ self._linear.reshape(-1, states.shape[-1]).mT).reshape(n, *self._offset.shape)
+        energy = xp.minimum(field, zero).sum(-1) + own + self._offset
+        return xp.moveaxis(energy, 0, -1)
 
-    def completed(self, state: Float[Tensor, "*problems n"]) -> Float[Tensor, "*problems n_all"]:
+    def completed(self, state: Float[Array, "*problems n"]) -> Float[Array, "*problems n_all"]:
         """One state of the smaller layer for each problem, with the best state of the other."""
-        field = (state.double().unsqueeze(-2) @ self._coupling).squeeze(-2) + self._other
-        other = (field < 0).to(state.dtype)
-        return torch.cat((state, other) if self._first else (other, state), dim=-1)
+        field = (double(state)[..., None, :] @ self._coupling)[..., 0, :] + self._other
+        other = cast(field < 0, state.dtype)
+        return namespace(state).concat((state, other) if self._first else (other, state), axis=-1)

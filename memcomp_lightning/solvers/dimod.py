@@ -1,17 +1,22 @@
 """Use any sampler of dimod as a solver: simulated annealing, a quantum annealer, D-Wave's hybrid service."""
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Generator, Tensor
+import numpy as np
 
+from memcomp_lightning import rng
+from memcomp_lightning.arrays import Array, alike, cast, namespace
 from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.problems.bqm import to_bqm
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,22 +36,22 @@ class DimodSolver:
     def __post_init__(self) -> None:
         check_parameters(self.sampler, self.parameters)
 
-    def minimise(self, qubo: Qubo, *, generator: Generator) -> QuboSolution:
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return every read of every problem; where one has fewer reads, the rest is marked as not run."""
-        begin = time.perf_counter()
-        flat = [problem_at(qubo, index) for index in range(max(1, qubo.offset.numel()))]
+        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        flat = [problem_at(qubo, index) for index in range(max(1, math.prod(qubo.problems)))]
         reads = [reads_of(sample_set(self.sampler, one, self.parameters, generator), one) for one in flat]
         n_reads = max(len(x) for x in reads)
-        x = torch.stack([torch.cat((x, x[:1].expand(n_reads - len(x), -1))) for x in reads])
-        x = x.view(*qubo.problems, n_reads, qubo.n)
-        counts = torch.tensor([len(x) for x in reads], device=x.device).view(*qubo.problems, 1)
-        was_run = torch.arange(n_reads, device=x.device) < counts
-        status = torch.where(was_run, int(Status.STEP_BUDGET), int(Status.NOT_RUN))
-        energies = qubo.energy(x).masked_fill(~was_run, torch.inf)
-        return QuboSolution(x, energies, status, was_run.long(), time.perf_counter() - begin)
+        x = xp.stack([xp.concat((x, xp.broadcast_to(x[:1], (n_reads - len(x), qubo.n)))) for x in reads])
+        x = x.reshape(*qubo.problems, n_reads, qubo.n)
+        counts = alike(np.array([len(x) for x in reads]), x).reshape(*qubo.problems, 1)
+        was_run = xp.arange(n_reads, device=x.device) < counts
+        status = xp.where(was_run, int(Status.STEP_BUDGET), int(Status.NOT_RUN))
+        energies = xp.where(was_run, qubo.energy(x), xp.inf)
+        return QuboSolution(x, energies, status, cast(was_run, xp.int64), time.perf_counter() - begin)
 
 
-def sample_set(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: Generator) -> Any:
+def sample_set(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generator: "Generator") -> Any:
     """The sample set of one problem.
 
     Raises:
@@ -54,7 +59,7 @@ def sample_set(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generato
     """
     given = dict(parameters)
     if "seed" in sampler.parameters and "seed" not in given:
-        given["seed"] = int(torch.randint(2**31, (), generator=generator, device=generator.device))
+        given["seed"] = int(rng.integers(2**31, (), generator=generator, like=qubo.linear))
     try:
         return sampler.sample(to_bqm(qubo), **given)
     except (TypeError, ValueError) as error:
@@ -62,20 +67,18 @@ def sample_set(sampler: Any, qubo: Qubo, parameters: Mapping[str, Any], generato
         raise SettingError(f"parameters = {dict(parameters)} does not suit {kind}.sample: {error}") from error
 
 
-def reads_of(answer: Any, qubo: Qubo) -> Tensor:
+def reads_of(answer: Any, qubo: Qubo) -> Array:
     """Assignments of one problem, a row a read, ``(n_reads, n)``."""
-    record, order = answer.record, torch.as_tensor([int(variable) for variable in answer.variables])
-    rows = torch.as_tensor(record.sample.astype("float32")).repeat_interleave(
-        torch.as_tensor(record.num_occurrences.astype("int64")), dim=0
-    )
-    x = torch.empty_like(rows)
-    x[:, order] = (rows > 0).to(rows.dtype)
-    return x.to(qubo.linear)
+    record, order = answer.record, np.array([int(variable) for variable in answer.variables], np.int64)
+    rows = np.repeat(record.sample > 0, record.num_occurrences, axis=0)
+    x = np.empty_like(rows)
+    x[:, order] = rows
+    return cast(alike(x, qubo.linear), qubo.linear.dtype)
 
 
 def problem_at(qubo: Qubo, index: int) -> Qubo:
     """One of the problems."""
-    n = max(1, qubo.offset.numel())
+    n = max(1, math.prod(qubo.problems))
     coupling = qubo.coupling.reshape(n, *qubo.graph.edge_shape)[index]
     return Qubo(qubo.graph, coupling, qubo.linear.reshape(n, qubo.n)[index], qubo.offset.reshape(n)[index])
 

@@ -17,7 +17,7 @@ MOST_RECORDED = 4 * 2**30
 
 def minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
     """The solver's answer; without variables there is one state, and no solver has to look for it."""
-    generator, given = rng.stream(seed, "solver"), problem.problem
+    generator, given = rng.numpy_stream(seed, "solver"), problem.problem
     if given.n == 0:
         return BruteForce().minimise(as_qubo(given), generator=generator)
     try:
@@ -58,7 +58,7 @@ def memory_needed(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
         return 0
     longer = () if isinstance(problem, Qubo) else problem.longer
     pairs = 0 if isinstance(problem.graph, Bipartite) else math.prod(problem.graph.edge_shape)
-    numbers = problem.n + pairs + sum(block.variables.numel() for block in longer)
+    numbers = problem.n + pairs + sum(math.prod(block.variables.shape) for block in longer)
     return _NUMBERS_EACH * 8 * int(getattr(solver, "n_restarts", 1)) * numbers
 
 

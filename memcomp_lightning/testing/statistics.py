@@ -4,8 +4,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 
 
 def state_counts(x: Tensor) -> Tensor:

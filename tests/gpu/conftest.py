@@ -6,8 +6,6 @@ import pytest
 import stand_in
 import torch
 
-from memcomp_lightning import rng
-
 
 @pytest.fixture(params=["stand_in", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
@@ -17,6 +15,6 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
             pytest.skip("needs a CUDA device")
         yield "cuda"
         return
-    monkeypatch.setattr(rng, "Generator", stand_in.Generator)
+    monkeypatch.setattr(torch, "Generator", stand_in.Generator)
     with stand_in.usable():
         yield stand_in.NAME

@@ -43,13 +43,16 @@ class OnDevice(Tensor):
         return _run(function, args, kwargs or {})
 
 
-class Generator(torch.Generator):
+HostGenerator = torch.Generator
+
+
+class Generator(HostGenerator):
     """Draws on the device; the same numbers as on the host."""
 
     device = property(lambda self: torch.device(NAME))
 
-    def __new__(cls, device: torch.device | str = "cpu") -> torch.Generator:
-        return super().__new__(cls) if torch.device(device).type == NAME else torch.Generator()
+    def __new__(cls, device: torch.device | str = "cpu") -> HostGenerator:
+        return super().__new__(cls) if torch.device(device).type == NAME else HostGenerator()
 
 
 class _Everything(TorchDispatchMode):

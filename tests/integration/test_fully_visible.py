@@ -13,6 +13,7 @@ from running import Outcome
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, ShiftingBars
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.likelihood import (
     kl_divergence,
     log_likelihood,
@@ -21,7 +22,6 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import BoltzmannMachine, Gaussian
 from memcomp_lightning.models.connectivity import grid
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import (

@@ -19,7 +19,7 @@ import pytest
 from numba import njit
 from running import Outcome
 
-from memcomp_lightning import compiling
+from memcomp_lightning import compiling, plotting
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
 from memcomp_lightning.cli.output import say, tolerant_streams
@@ -157,7 +157,7 @@ def test_a_picture_that_cannot_be_written_costs_the_picture_alone(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     Path("edge.txt").write_text(EDGE)
-    monkeypatch.setattr(solving, "plot_trajectory", full)
+    monkeypatch.setattr(plotting, "plot_trajectory", full)
     outcome = memcomp_solve("problem=edge.txt", "solver.max_steps=40", "hydra.run.dir=run")
     assert outcome.status == 2
     assert Path("run/solution.json").exists()

@@ -5,7 +5,7 @@ import torch
 from scipy import stats
 
 from memcomp_lightning import rng
-from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 
 PROBABILITIES = torch.tensor([0.37, 0.29, 0.17, 0.11, 0.06])

@@ -24,6 +24,6 @@ def test_examples_of_the_module(name):
 
 def test_examples_are_found():
     """Also behind the shape checks, which wrap functions."""
-    module = importlib.import_module("memcomp_lightning.models.enumeration")
-    assert sum(len(test.examples) for test in doctest.DocTestFinder().find(module)) == 1
+    module = importlib.import_module("memcomp_lightning.enumeration")
+    assert sum(len(test.examples) for test in doctest.DocTestFinder().find(module)) == 2
     assert len(MODULES) > 40

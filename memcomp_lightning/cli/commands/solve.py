@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
+from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor
 
 from memcomp_lightning.cli.arguments import read
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
@@ -19,7 +20,6 @@ from memcomp_lightning.configuration.hydra_versions import MAIN
 from memcomp_lightning.configuration.problems import prepare
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import Problem, ProblemFileError, in_full
 from memcomp_lightning.runs.table import short_path
 from memcomp_lightning.solvers import Answer, QuboSolution, QuboSolver, write_solution
@@ -83,7 +83,7 @@ def _table(problem: Problem, answer: Answer, wall_time_s: float) -> str:
     return "\n".join(f"  {name.ljust(width)}  {value}" for name, value in rows)
 
 
-def _bits(x: Tensor) -> str:
+def _bits(x: NDArray[np.bool_]) -> str:
     return "".join("1" if bit else "0" for bit in x.tolist())
 
 
@@ -116,6 +116,8 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
 
 def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:
     """Write the picture for the screen and the one for print; return the first."""
+    from memcomp_lightning.plotting import plot_trajectory  # matplotlib, which few runs need
+
     figure = plot_trajectory(trajectory, title=title)
     picture = folder / "trajectory.png"
     for path in (picture, picture.with_suffix(".svg")):

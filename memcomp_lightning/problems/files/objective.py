@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from memcomp_lightning.arrays import double
 from memcomp_lightning.problems.files.numbers import LARGEST_INT64, Exact, Numbers, in_full
 from memcomp_lightning.problems.files.source import Source
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
@@ -145,35 +144,36 @@ def from_terms(
     size = 9 * numbers.total  # a pair of spins: 4 x_i x_j - 2 x_i - 2 x_j + 1
     integers = None
     if numbers.integers.dtype != object:  # energies fit: sums on the way that overflow wrap round, and back again
-        integers = _as_qubo(terms, len(used), torch.from_numpy(sign * numbers.integers))
+        integers = _as_qubo(terms, len(used), sign * numbers.integers)
     _check_size(source, numbers.exact(size))
     if integers is None or size > LARGEST_INT64 or numbers.decimals > 22:  # 10^22 is the last that float64 holds
-        problem = _as_qubo(terms, len(used), torch.from_numpy(sign * numbers.double()))
+        problem = _as_qubo(terms, len(used), sign * numbers.double())
     else:
         parts = (integers.coupling, integers.linear, integers.offset)
-        size = sum(int(part.abs().sum()) for part in parts)
-        problem = Qubo(integers.graph, *(part.double() / 10**numbers.decimals for part in parts))
+        size = sum(int(abs(part).sum()) for part in parts)
+        problem = Qubo(integers.graph, *(double(part) / 10**numbers.decimals for part in parts))
     said = [*remarks, *_repeated(i, j, problem), *_rounding(numbers.exact(size), size)]
     objective = Objective(name, terms, maximised)
     resolved = _resolved(size, numbers.decimals, len(i))
     return Parsed(problem, objective, n, used.astype(np.int64), tuple(said), integers, resolved)
 
 
-def _as_qubo(terms: Terms, n: int, values: Tensor) -> Qubo:
+def _as_qubo(terms: Terms, n: int, values: NDArray[Any]) -> Qubo:
     """The sum as a QUBO of the same dtype as the values; the last of these is a constant."""
-    i, j = torch.from_numpy(terms.i), torch.from_numpy(terms.j)
-    v, constant = values[:-1], values[-1]
+    i, j, v, constant = terms.i, terms.j, values[:-1], values[-1]
     if terms.kind == "product":
         return Qubo.from_coo(n, i, j, v, constant)
     own = i == j
     (a, b, w), (k, h) = (t[~own] for t in (i, j, v)), (t[own] for t in (i, v))
     if terms.kind == "cut":
-        return Qubo.from_coo(n, torch.cat((a, a, b)), torch.cat((b, a, b)), torch.cat((-2 * w, w, w)), constant)
+        return Qubo.from_coo(
+            n, np.concatenate((a, a, b)), np.concatenate((b, a, b)), np.concatenate((-2 * w, w, w)), constant
+        )
     return Qubo.from_coo(
         n,
-        torch.cat((a, a, b, k)),
-        torch.cat((b, a, b, k)),
-        torch.cat((4 * w, -2 * w, -2 * w, 2 * h)),
+        np.concatenate((a, a, b, k)),
+        np.concatenate((b, a, b, k)),
+        np.concatenate((4 * w, -2 * w, -2 * w, 2 * h)),
         constant + w.sum() - h.sum(),
     )
 
@@ -281,7 +281,7 @@ def from_clauses(
     problem = WeightedMaxSat.from_clauses(len(used), renamed, [soft.exact(unit) for unit in units])
     integers = None
     if sum(units) <= LARGEST_INT64 and all(len(set(clause)) <= 2 for clause in renamed):
-        integers = to_qubo(WeightedMaxSat.from_clauses(len(used), renamed, units, dtype=torch.int64))
+        integers = to_qubo(WeightedMaxSat.from_clauses(len(used), renamed, units, dtype=np.int64))
     n_empty = int((is_hard & (np.array(lengths, np.int64) == 0)).sum())
     empty = [f"{n_empty} hard clause{'s are' if n_empty > 1 else ' is'} empty: no assignment satisfies all."]
     said = [*remarks, *(empty if n_empty else ()), *_rounding(soft.exact(size), size)]

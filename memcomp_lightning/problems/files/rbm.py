@@ -5,12 +5,12 @@ import zipfile
 import zlib
 
 import numpy as np
-import torch
 
-from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.arrays import as_array
 from memcomp_lightning.problems.files.objective import Objective, Parsed, RbmEnergy
 from memcomp_lightning.problems.files.source import Source
-from memcomp_lightning.problems.from_model import from_model
+from memcomp_lightning.problems.from_model import from_quadratic_form
+from memcomp_lightning.problems.graph import Bipartite
 
 
 def parse(source: Source, maximise: bool) -> Parsed:
@@ -43,7 +43,7 @@ def parse(source: Source, maximise: bool) -> Parsed:
         size = sum(float(np.abs(array).sum()) for array in double.values())
     if not np.isfinite(4 * size):
         raise source.fault("numbers whose sums are infinite in float64", "smaller ones")
-    rbm = RBM(n_visible=len(b), n_hidden=len(c)).double()
-    rbm.load_state_dict({name: torch.from_numpy(array) for name, array in double.items()})
-    n = len(b) + len(c)
-    return Parsed(from_model(rbm), Objective("E(v, h)", RbmEnergy(**double)), n, np.arange(n))
+    layers = Bipartite(n_first=len(b), n_second=len(c))
+    bias = as_array(np.concatenate((double["b"], double["c"])))
+    problem = from_quadratic_form(layers, as_array(double["weight"]), bias)
+    return Parsed(problem, Objective("E(v, h)", RbmEnergy(**double)), layers.n, np.arange(layers.n))

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.samplers.positive.base import PositivePhase
 from memcomp_lightning.types import Configurations
 

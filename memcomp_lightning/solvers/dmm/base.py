@@ -2,8 +2,7 @@
 
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from torch import Tensor
-
+from memcomp_lightning.arrays import Array
 from memcomp_lightning.problems.maxsat import WeightedMaxSat
 from memcomp_lightning.problems.qubo import Qubo
 
@@ -18,7 +17,7 @@ class HasVoltage(Protocol):
     """A state of the machine; voltages are always part of it."""
 
     @property
-    def voltage(self) -> Tensor:
+    def voltage(self) -> Array:
         """``(*problems, n_restarts, n)`` in [-1, 1]; > 0 reads as TRUE."""
         ...
 
@@ -26,7 +25,7 @@ class HasVoltage(Protocol):
 class VectorField(Protocol[MachineT, StateT]):
     """One set of equations of the DMM, as pure functions: settings are frozen, states are taken and returned.
 
-    ``MachineT`` holds the problem's tensors as the equations use them; ``StateT`` is a NamedTuple of tensors.
+    ``MachineT`` holds the problem's arrays as the equations use them; ``StateT`` is a NamedTuple of arrays.
     Those whose names end in ``long_term`` are kept over a warm restart and are 1 at rest.
     """
 
@@ -49,16 +48,16 @@ class VectorField(Protocol[MachineT, StateT]):
         """Scale a problem into the machine's units."""
         ...
 
-    def stability(self, machine: MachineT) -> Tensor:
+    def stability(self, machine: MachineT) -> Array:
         """Factor > 0 on ``StepControl.change``, so that steps suit the problem's size, ``(*problems, 1)``."""
         ...
 
-    def init(self, machine: MachineT, voltage: Tensor) -> StateT:
+    def init(self, machine: MachineT, voltage: Array) -> StateT:
         """The state at the start: voltages ``(*problems, n_restarts, n)`` as given, and their memories."""
         ...
 
     def derivative(self, machine: MachineT, state: StateT) -> StateT:
-        """Right-hand side of the ODE, one tensor for each of the state's."""
+        """Right-hand side of the ODE, one array for each of the state's."""
         ...
 
     def bound(self, machine: MachineT, state: StateT) -> StateT:

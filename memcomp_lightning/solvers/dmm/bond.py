@@ -6,12 +6,10 @@ Source: [P] Pei, Di Ventra, arXiv:2102.04557, eqs. for v, X and Y. Constants: do
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
-
+from memcomp_lightning.arrays import Array, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import Graph
-from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
+from memcomp_lightning.problems.maxsat import WeightedMaxSat, over_states, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.scaling import (
@@ -31,19 +29,19 @@ class BondMachine(NamedTuple):
     """
 
     graph: Graph
-    bond: Tensor
-    field: Tensor
-    pull_scale: Tensor
+    bond: Array
+    field: Array
+    pull_scale: Array
 
 
 class BondState(NamedTuple):
     """Voltages ``(*problems, n_restarts, n)``, memories of the bonds and of the fields."""
 
-    voltage: Tensor
-    short_term: Tensor
-    long_term: Tensor
-    field_short_term: Tensor
-    field_long_term: Tensor
+    voltage: Array
+    short_term: Array
+    long_term: Array
+    field_short_term: Array
+    field_long_term: Array
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -118,63 +116,64 @@ class BondField:
         norm = coupling_norm(qubo.graph, coupling)
         scale = norm / collective_mode(qubo.graph, coupling / expand(norm, n_axes))
         bond = -coupling / expand(scale, n_axes)
-        field = decisive(qubo.graph, bond, field / scale.unsqueeze(-1))
+        field = decisive(qubo.graph, bond, field / scale[..., None])
         return BondMachine(
             graph=qubo.graph,
-            bond=bond.unsqueeze(-1 - n_axes),
-            field=field.unsqueeze(-2),
+            bond=over_states(bond, n_axes),
+            field=field[..., None, :],
             pull_scale=expand(mean_strength(qubo.graph, bond), 2),
         )
 
-    def stability(self, machine: BondMachine) -> Tensor:
+    def stability(self, machine: BondMachine) -> Array:
         """1: the scale of the bonds takes care of it."""
-        return torch.ones_like(machine.pull_scale.squeeze(-1))
+        return namespace(machine.bond).ones_like(machine.pull_scale[..., 0])
 
-    def init(self, machine: BondMachine, voltage: Tensor) -> BondState:
+    def init(self, machine: BondMachine, voltage: Array) -> BondState:
         """Short-term memories at ``short_term_start``, long-term ones at 1."""
         first, second = machine.graph.gather(voltage)
-        bond = torch.ones_like(first * second)
+        xp = namespace(voltage)
+        bond = xp.ones_like(first * second)
         return BondState(
             voltage=voltage,
             short_term=self.short_term_start * bond,
             long_term=bond,
-            field_short_term=torch.full_like(voltage, self.short_term_start),
-            field_long_term=torch.ones_like(voltage),
+            field_short_term=xp.full_like(voltage, self.short_term_start),
+            field_long_term=xp.ones_like(voltage),
         )
 
     def derivative(self, machine: BondMachine, state: BondState) -> BondState:
         """Right-hand side; each line names its equation."""
         voltage = state.voltage
         first, second = machine.graph.gather(voltage)
+        sign = namespace(voltage).sign
         # [P]: dv_i = alpha sum_j J_ij v_j - 2 beta (sum_j X_ij) v_i.
         drive = machine.graph.scatter(machine.bond * second, machine.bond * first) + machine.field
-        strength = machine.bond.abs() * state.short_term
-        pull = machine.graph.scatter(strength, strength) + machine.field.abs() * state.field_short_term
+        strength = abs(machine.bond) * state.short_term
+        pull = machine.graph.scatter(strength, strength) + abs(machine.field) * state.field_short_term
         return BondState(
             voltage=self.alpha * drive - 2 * self.beta / machine.pull_scale * pull * voltage,
             # [P]: dX = gamma C - Y with C = 1 + kappa sign(J) v_i v_j.
-            short_term=self.gamma * (1 + self.kappa * machine.bond.sign() * first * second) - state.long_term,
+            short_term=self.gamma * (1 + self.kappa * sign(machine.bond) * first * second) - state.long_term,
             # [P]: dY = delta X - zeta.
             long_term=self.delta * state.short_term - self.zeta,
-            field_short_term=self.gamma * (1 + self.kappa * machine.field.sign() * voltage)
-            - state.field_long_term,
+            field_short_term=self.gamma * (1 + self.kappa * sign(machine.field) * voltage) - state.field_long_term,
             field_long_term=self.delta * state.field_short_term - self.zeta,
         )
 
-    def short_term_after(self, machine: BondMachine, state: BondState, dt: Tensor) -> dict[str, Tensor]:
+    def short_term_after(self, machine: BondMachine, state: BondState, dt: Array) -> dict[str, Array]:
         """X at frozen voltages and Y moves in a straight line: the exact update is Euler's."""
         rate = self.derivative(machine, state)
         return {
             "short_term": state.short_term + expand(dt, rate.short_term.ndim - dt.ndim) * rate.short_term,
-            "field_short_term": state.field_short_term + dt.unsqueeze(-1) * rate.field_short_term,
+            "field_short_term": state.field_short_term + dt[..., None] * rate.field_short_term,
         }
 
     def bound(self, machine: BondMachine, state: BondState) -> BondState:
         """V in [-1, 1], X in [short_term_min, 1], Y in [1, long_term_max]."""
         return BondState(
-            voltage=state.voltage.clamp(-1, 1),
-            short_term=state.short_term.clamp(self.short_term_min, 1),
-            long_term=state.long_term.clamp(1, self.long_term_max),
-            field_short_term=state.field_short_term.clamp(self.short_term_min, 1),
-            field_long_term=state.field_long_term.clamp(1, self.long_term_max),
+            voltage=state.voltage.clip(-1, 1),
+            short_term=state.short_term.clip(self.short_term_min, 1),
+            long_term=state.long_term.clip(1, self.long_term_max),
+            field_short_term=state.field_short_term.clip(self.short_term_min, 1),
+            field_long_term=state.field_long_term.clip(1, self.long_term_max),
         )

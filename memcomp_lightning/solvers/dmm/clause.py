@@ -8,12 +8,10 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
+from memcomp_lightning.arrays import Array, add_up, cast, multiply_add, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import Graph
-from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, from_qubo
+from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, from_qubo, over_states
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.scaling import (
@@ -23,39 +21,40 @@ from memcomp_lightning.solvers.dmm.scaling import (
     decisive,
     effective_degree,
     expand,
+    mean_of_used,
     step_scale,
 )
 
 
 class ClauseMachine(NamedTuple):
-    """A problem in the machine's units; per-clause tensors have an axis of size 1 for the restarts.
+    """A problem in the machine's units; per-clause arrays have an axis of size 1 for the restarts.
 
     Clauses of three literals and more are padded to the longest one with polarity 0. ``degree`` is the
     effective one, ``(*problems,)``.
     """
 
     graph: Graph
-    weight: Tensor
-    first: Tensor
-    second: Tensor
-    unit: Tensor
-    unit_sign: Tensor
-    longer_variables: Tensor
-    longer_polarity: Tensor
-    longer_weight: Tensor
-    stability: Tensor
-    degree: Tensor
+    weight: Array
+    first: Array
+    second: Array
+    unit: Array
+    unit_sign: Array
+    longer_variables: Array
+    longer_polarity: Array
+    longer_weight: Array
+    stability: Array
+    degree: Array
 
 
 class ClauseState(NamedTuple):
     """Voltages ``(*problems, n_restarts, n)``, memories of pairs, of unit clauses and of longer clauses."""
 
-    voltage: Tensor
-    short_term: Tensor
-    long_term: Tensor
-    unit_long_term: Tensor
-    longer_short_term: Tensor
-    longer_long_term: Tensor
+    voltage: Array
+    short_term: Array
+    long_term: Array
+    unit_long_term: Array
+    longer_short_term: Array
+    longer_long_term: Array
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -116,7 +115,7 @@ class ClauseField:
         require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
 
     def most_long_term(self, degree: Any) -> Any:
-        """Upper bound of the long-term memories at an effective degree, a tensor or an array."""
+        """Upper bound of the long-term memories at an effective degree, an array."""
         return 1 + (self.long_term_max - 1) * degree**-DEGREE_EXPONENT
 
     def build(self, problem: Qubo | WeightedMaxSat) -> ClauseMachine:
@@ -126,55 +125,53 @@ class ClauseField:
         longer = _padded(maxsat)
         # Longer clauses stand behind the pairs while the scale is found.
         n_pairs = math.prod(maxsat.graph.edge_shape)
-        flat = torch.cat((maxsat.weight.reshape(*maxsat.problems, n_pairs), longer.weight), dim=-1)
+        xp, flat = namespace(maxsat.unit), maxsat.weight.reshape(*maxsat.problems, n_pairs)
+        flat = xp.concat((flat, longer.weight), axis=-1)
         flat, unit = by_largest(flat, maxsat.unit, 1)
         weight = flat[..., :n_pairs].reshape(maxsat.weight.shape)
         longer_weight = flat[..., n_pairs:]
         scale = coupling_norm(maxsat.graph, weight)
         if maxsat.longer:
-            power = _per_variable(longer, longer_weight.square(), maxsat.n)
-            norm = (power.sum(-1) / (power > 0).sum(-1).clamp(min=1)).sqrt()
+            norm = mean_of_used(_per_variable(longer, longer_weight * longer_weight, maxsat.n)) ** 0.5
             alone = (flat[..., :n_pairs] == 0).all(-1) & (norm > 0)
-            scale = torch.where(alone, norm, scale)
-        weight, unit = weight / expand(scale, n_axes), unit / scale.unsqueeze(-1)
+            scale = xp.where(alone, norm, scale)
+        weight, unit = weight / expand(scale, n_axes), unit / scale[..., None]
         if not maxsat.longer:
             unit = decisive(maxsat.graph, weight, unit)
-        longer_weight = longer_weight / scale.unsqueeze(-1)
+        longer_weight = longer_weight / scale[..., None]
         size, power = (
             maxsat.graph.scatter(of_pairs, of_pairs) + _per_variable(longer, of_longer, maxsat.n)
-            for of_pairs, of_longer in ((weight, longer_weight), (weight.square(), longer_weight.square()))
+            for of_pairs, of_longer in ((weight, longer_weight), (weight * weight, longer_weight * longer_weight))
         )
         return ClauseMachine(
             graph=maxsat.graph,
-            weight=weight.unsqueeze(-1 - n_axes),
-            first=maxsat.first.unsqueeze(-1 - n_axes),
-            second=maxsat.second.unsqueeze(-1 - n_axes),
-            unit=unit.unsqueeze(-2),
-            unit_sign=unit.sign().unsqueeze(-2),
+            weight=over_states(weight, n_axes),
+            first=over_states(maxsat.first, n_axes),
+            second=over_states(maxsat.second, n_axes),
+            unit=unit[..., None, :],
+            unit_sign=xp.sign(unit)[..., None, :],
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
-            longer_weight=longer_weight.unsqueeze(-2),
-            stability=step_scale(maxsat.n, (size > 0).sum(-1)).to(weight.dtype).unsqueeze(-1),
+            longer_weight=longer_weight[..., None, :],
+            stability=cast(step_scale(maxsat.n, (size > 0).sum(-1)), weight.dtype)[..., None],
             degree=effective_degree(size, power),
         )
 
-    def stability(self, machine: ClauseMachine) -> Tensor:
+    def stability(self, machine: ClauseMachine) -> Array:
         """Smaller steps for larger problems."""
         return machine.stability
 
-    def init(self, machine: ClauseMachine, voltage: Tensor) -> ClauseState:
+    def init(self, machine: ClauseMachine, voltage: Array) -> ClauseState:
         """x_s(0) = C(0), long-term memories at 1 ([B], methods)."""
-        unsatisfied, _, _ = _unsatisfaction(machine, voltage)
-        longer = voltage.new_zeros(*voltage.shape[:-1], machine.longer_weight.shape[-1])
-        if machine.longer_weight.numel():
-            longer = _falsehood(machine, voltage).amin(-1)
+        xp, unsatisfied = namespace(voltage), _unsatisfaction(machine, voltage)[0]
+        longer = xp.min(_falsehood(machine, voltage), axis=-1)
         return ClauseState(
             voltage=voltage,
             short_term=unsatisfied,
-            long_term=torch.ones_like(unsatisfied),
-            unit_long_term=torch.ones_like(voltage),
+            long_term=xp.ones_like(unsatisfied),
+            unit_long_term=xp.ones_like(voltage),
             longer_short_term=longer,
-            longer_long_term=torch.ones_like(longer),
+            longer_long_term=xp.ones_like(longer),
         )
 
     def derivative(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
@@ -189,13 +186,13 @@ class ClauseField:
         rigidity_first = rigidity * (false_first <= false_second)
         # [B] eq. 2, one sum for each end of the clauses.
         drive = machine.graph.scatter(
-            machine.first * torch.addcmul(rigidity_first, gradient, false_second),
-            machine.second * torch.addcmul(rigidity - rigidity_first, gradient, false_first),
+            machine.first * multiply_add(rigidity_first, gradient, false_second),
+            machine.second * multiply_add(rigidity - rigidity_first, gradient, false_first),
         )
         # Deviation: unit clauses pull with a long-term memory of their own, not as two equal literals.
         drive = drive + self.unit_pull * machine.unit * state.unit_long_term
         longer_unsatisfied = state.longer_short_term
-        if machine.longer_weight.numel():
+        if machine.longer_weight.shape[-1]:
             longer_drive, longer_unsatisfied = self._longer(machine, state)
             drive = drive + longer_drive
         return ClauseState(
@@ -207,37 +204,38 @@ class ClauseField:
             longer_long_term=self._long_term_rate(longer_unsatisfied, state.longer_long_term),
         )
 
-    def _longer(self, machine: ClauseMachine, state: ClauseState) -> tuple[Tensor, Tensor]:
+    def _longer(self, machine: ClauseMachine, state: ClauseState) -> tuple[Array, Array]:
         """Drive and C of the clauses of three literals and more: the same equations, [B] eqs. 2 to 5."""
         false = _falsehood(machine, state.voltage)
-        (smallest, next_smallest), at = false.topk(2, largest=False).values.unbind(-1), false.argmin(-1)
-        is_smallest = torch.nn.functional.one_hot(at, false.shape[-1]).bool()
-        others = torch.where(is_smallest, next_smallest.unsqueeze(-1), smallest.unsqueeze(-1))
+        xp, smallest = namespace(false), namespace(false).min(false, axis=-1)
+        is_smallest = false.argmin(-1)[..., None] == xp.arange(false.shape[-1], device=false.device)
+        next_smallest = xp.min(xp.where(is_smallest, xp.inf, false), axis=-1)
+        others = xp.where(is_smallest, next_smallest[..., None], smallest[..., None])
         gradient = machine.longer_weight * state.longer_long_term * state.longer_short_term
         stiffness = (1 + self.zeta * state.longer_long_term) * (1 - state.longer_short_term)
         rigidity = machine.longer_weight * stiffness * smallest
-        push = machine.longer_polarity * (gradient.unsqueeze(-1) * others + rigidity.unsqueeze(-1) * is_smallest)
-        drive = torch.zeros_like(state.voltage)
-        drive.index_add_(-1, machine.longer_variables.flatten(), push.flatten(-2))
-        return drive, smallest
+        push = machine.longer_polarity * (gradient[..., None] * others + rigidity[..., None] * is_smallest)
+        of_literals = push.reshape(*push.shape[:-2], -1)
+        return add_up(of_literals, machine.longer_variables.reshape(-1), state.voltage.shape[-1]), smallest
 
-    def _short_term_rate(self, unsatisfied: Tensor, short_term: Tensor) -> Tensor:
+    def _short_term_rate(self, unsatisfied: Array, short_term: Array) -> Array:
         """[B] eq. 6."""
         return self.beta * (short_term + self.epsilon) * (unsatisfied - self.gamma)
 
-    def _long_term_rate(self, unsatisfied: Tensor, long_term: Tensor) -> Tensor:
+    def _long_term_rate(self, unsatisfied: Array, long_term: Array) -> Array:
         """[B] eq. 7. Deviations: no factor (1 + w), and below delta the decay towards 1 is exponential."""
         excess = unsatisfied - self.delta
-        return self.alpha * torch.addcmul(excess.clamp(min=0), excess.clamp(max=0), long_term - 1)
+        return self.alpha * multiply_add(excess.clip(min=0), excess.clip(max=0), long_term - 1)
 
-    def short_term_after(self, machine: ClauseMachine, state: ClauseState, dt: Tensor) -> dict[str, Tensor]:
+    def short_term_after(self, machine: ClauseMachine, state: ClauseState, dt: Array) -> dict[str, Array]:
         """x_s after ``dt`` at frozen voltages: ``(x_s + eps) exp(beta (C - gamma) dt) - eps``."""
-        unsatisfied, _, _ = _unsatisfaction(machine, state.voltage)
-        after = {"short_term": (state.short_term, unsatisfied)}
-        if machine.longer_weight.numel():
-            after["longer_short_term"] = (state.longer_short_term, _falsehood(machine, state.voltage).amin(-1))
+        xp = namespace(state.voltage)
+        after = {
+            "short_term": (state.short_term, _unsatisfaction(machine, state.voltage)[0]),
+            "longer_short_term": (state.longer_short_term, xp.min(_falsehood(machine, state.voltage), axis=-1)),
+        }
         return {
-            name: (x + self.epsilon) * (self.beta * (c - self.gamma) * expand(dt, c.ndim - dt.ndim)).exp()
+            name: (x + self.epsilon) * xp.exp(self.beta * (c - self.gamma) * expand(dt, c.ndim - dt.ndim))
             - self.epsilon
             for name, (x, c) in after.items()
         }
@@ -245,55 +243,57 @@ class ClauseField:
     def bound(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
         """V in [-1, 1], x_s in [0, 1], long-term memories in [1, :meth:`most_long_term`]."""
 
-        def bounded(memory: Tensor) -> Tensor:
+        def bounded(memory: Array) -> Array:
             most = self.most_long_term(machine.degree)
-            return torch.minimum(memory.clamp(min=1), expand(most, memory.ndim - most.ndim))
+            return namespace(memory).minimum(memory.clip(min=1), expand(most, memory.ndim - most.ndim))
 
         return ClauseState(
-            voltage=state.voltage.clamp(-1, 1),
-            short_term=state.short_term.clamp(0, 1),
+            voltage=state.voltage.clip(-1, 1),
+            short_term=state.short_term.clip(0, 1),
             long_term=bounded(state.long_term),
             unit_long_term=bounded(state.unit_long_term),
-            longer_short_term=state.longer_short_term.clamp(0, 1),
+            longer_short_term=state.longer_short_term.clip(0, 1),
             longer_long_term=bounded(state.longer_long_term),
         )
 
 
-def _unsatisfaction(machine: ClauseMachine, voltage: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _unsatisfaction(machine: ClauseMachine, voltage: Array) -> tuple[Array, Array, Array]:
     """C of each pair, and how false each of its two literals is: 1/2 (1 - q v)."""
     first, second = machine.graph.gather(voltage)
     false_first = 0.5 - 0.5 * machine.first * first
     false_second = 0.5 - 0.5 * machine.second * second
-    return torch.minimum(false_first, false_second), false_first, false_second
+    return namespace(voltage).minimum(false_first, false_second), false_first, false_second
 
 
-def _falsehood(machine: ClauseMachine, voltage: Tensor) -> Tensor:
+def _falsehood(machine: ClauseMachine, voltage: Array) -> Array:
     """How false each literal of the longer clauses is; 1 for a padded one, which is never the smallest."""
     false = 0.5 - 0.5 * machine.longer_polarity * voltage[..., machine.longer_variables]
-    return torch.where(machine.longer_polarity == 0, 1.0, false)
+    return namespace(false).where(machine.longer_polarity == 0, 1.0, false)
 
 
 def _padded(maxsat: WeightedMaxSat) -> Clauses:
     """All longer clauses as one block, padded with variable 0 at polarity 0."""
+    unit, xp = maxsat.unit, namespace(maxsat.unit)
     length = max((block.variables.shape[-1] for block in maxsat.longer), default=3)
-    blocks = maxsat.longer or (
-        Clauses(
-            variables=torch.zeros(0, length, dtype=torch.int64, device=maxsat.unit.device),
-            polarity=maxsat.unit.new_zeros(0, length),
-            weight=maxsat.unit.new_zeros(*maxsat.problems, 0),
-        ),
+    none = Clauses(
+        variables=xp.zeros((0, length), dtype=xp.int64, device=unit.device),
+        polarity=xp.zeros((0, length), dtype=unit.dtype, device=unit.device),
+        weight=xp.zeros((*maxsat.problems, 0), dtype=unit.dtype, device=unit.device),
     )
-    missing = [length - block.variables.shape[-1] for block in blocks]
-    pad = torch.nn.functional.pad
+
+    def padded(x: Array) -> Array:
+        missing = xp.zeros((len(x), length - x.shape[-1]), dtype=x.dtype, device=x.device)
+        return xp.concat((x, missing), axis=-1)
+
+    blocks = (none, *maxsat.longer)
     return Clauses(
-        variables=torch.cat([pad(b.variables, (0, k)) for b, k in zip(blocks, missing, strict=True)]),
-        polarity=torch.cat([pad(b.polarity, (0, k)) for b, k in zip(blocks, missing, strict=True)]),
-        weight=torch.cat([block.weight for block in blocks], dim=-1),
+        variables=xp.concat([padded(block.variables) for block in blocks]),
+        polarity=xp.concat([padded(block.polarity) for block in blocks]),
+        weight=xp.concat([block.weight for block in blocks], axis=-1),
     )
 
 
-def _per_variable(clauses: Clauses, values: Tensor, n: int) -> Tensor:
+def _per_variable(clauses: Clauses, values: Array, n: int) -> Array:
     """Sum of a number a clause over the clauses of each variable, ``(*problems, n)``."""
-    total = values.new_zeros(*values.shape[:-1], n)
-    per_literal = values.unsqueeze(-1) * (clauses.polarity != 0)
-    return total.index_add_(-1, clauses.variables.flatten(), per_literal.flatten(-2))
+    per_literal = values[..., None] * (clauses.polarity != 0)
+    return add_up(per_literal.reshape(*values.shape[:-1], -1), clauses.variables.reshape(-1), n)

@@ -4,9 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-import torch
-from torch import Tensor
-
+from memcomp_lightning.arrays import Array, multiply_add
 from memcomp_lightning.errors import require
 from memcomp_lightning.solvers.dmm.base import HasVoltage, VectorField
 
@@ -14,11 +12,11 @@ MachineT = TypeVar("MachineT")
 StateT = TypeVar("StateT", bound=HasVoltage)
 
 
-Shake = Callable[[Any, Tensor], Any]
+Shake = Callable[[Any, Array], Any]
 """From a state and the step sizes to the state with noise on its voltages."""
 
 
-def still(state: Any, dt: Tensor) -> Any:
+def still(state: Any, dt: Array) -> Any:
     """No noise."""
     return state
 
@@ -33,8 +31,8 @@ class Step(NamedTuple):
     """
 
     state: Any
-    dt: Tensor
-    rate: Tensor
+    dt: Array
+    rate: Array
 
 
 class Integrator(Protocol):
@@ -46,7 +44,7 @@ class Integrator(Protocol):
         machine: MachineT,
         state: StateT,
         *,
-        before: Tensor | None = None,
+        before: Array | None = None,
         shake: Shake = still,
     ) -> Step:
         """Return the next state.
@@ -86,10 +84,10 @@ class StepControl:
         require(self.change > 0, "change", self.change, "a number > 0")
         require(0 < self.dt_min <= self.dt_max, "dt_min", self.dt_min, f"a number in (0, dt_max = {self.dt_max}]")
 
-    def step_size(self, voltage_rate: Tensor, stability: Tensor) -> Tensor:
+    def step_size(self, voltage_rate: Array, stability: Array) -> Array:
         """Step sizes ``(*problems, n_restarts)`` from ``dv/dt``."""
-        size = voltage_rate.square().mean(-1).sqrt()
-        return (stability * self.change / size).clamp(self.dt_min, self.dt_max)
+        size = (voltage_rate * voltage_rate).mean(-1) ** 0.5
+        return (stability * self.change / size).clip(self.dt_min, self.dt_max)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -102,7 +100,7 @@ class AdaptiveEuler(StepControl):
         machine: MachineT,
         state: StateT,
         *,
-        before: Tensor | None = None,
+        before: Array | None = None,
         shake: Shake = still,
     ) -> Step:
         """Return the next state."""
@@ -138,7 +136,7 @@ class Splitting(StepControl):
         machine: MachineT,
         state: StateT,
         *,
-        before: Tensor | None = None,
+        before: Array | None = None,
         shake: Shake = still,
     ) -> Step:
         """Return the next state."""
@@ -159,7 +157,7 @@ class Strang(StepControl):
         machine: MachineT,
         state: StateT,
         *,
-        before: Tensor | None = None,
+        before: Array | None = None,
         shake: Shake = still,
     ) -> Step:
         """Return the next state."""
@@ -178,7 +176,7 @@ class ExactShortTerm(StepControl):
     """
 
     def step(
-        self, field: Any, machine: MachineT, state: StateT, *, before: Tensor | None = None, shake: Shake = still
+        self, field: Any, machine: MachineT, state: StateT, *, before: Array | None = None, shake: Shake = still
     ) -> Step:
         """Return the next state."""
         require(
@@ -206,39 +204,39 @@ class Heun(StepControl):
         machine: MachineT,
         state: StateT,
         *,
-        before: Tensor | None = None,
+        before: Array | None = None,
         shake: Shake = still,
     ) -> Step:
         """Return the next state."""
         rate = field.derivative(machine, state)
         dt = self.step_size(rate.voltage, field.stability(machine))
         ahead = field.derivative(machine, field.bound(machine, _move(state, rate, dt)))
-        mean = type(rate)(*((a + b) / 2 for a, b in zip(_tensors(rate), _tensors(ahead), strict=True)))
+        mean = type(rate)(*((a + b) / 2 for a, b in zip(_arrays(rate), _arrays(ahead), strict=True)))
         return Step(field.bound(machine, shake(_move(state, mean, dt), dt)), dt, rate.voltage)
 
 
-def _move(state: StateT, rate: StateT, dt: Tensor) -> StateT:
-    """``state + dt rate``, for all tensors."""
+def _move(state: StateT, rate: StateT, dt: Array) -> StateT:
+    """``state + dt rate``, for all arrays."""
     moved = (
-        torch.addcmul(x, dt.reshape(*dt.shape, *(1,) * (x.ndim - dt.ndim)), x_rate)
-        for x, x_rate in zip(_tensors(state), _tensors(rate), strict=True)
+        multiply_add(x, dt.reshape(*dt.shape, *(1,) * (x.ndim - dt.ndim)), x_rate)
+        for x, x_rate in zip(_arrays(state), _arrays(rate), strict=True)
     )
     return type(state)(*moved)
 
 
-def _move_voltage(state: Any, rate: Tensor, dt: Tensor) -> Any:
+def _move_voltage(state: Any, rate: Array, dt: Array) -> Any:
     """Move the voltages alone."""
-    return state._replace(voltage=state.voltage + dt.unsqueeze(-1) * rate)
+    return state._replace(voltage=state.voltage + dt[..., None] * rate)
 
 
-def _move_memories(field: Any, machine: Any, state: Any, dt: Tensor) -> Any:
+def _move_memories(field: Any, machine: Any, state: Any, dt: Array) -> Any:
     """Move the memories alone, at the state's voltages."""
     moved = _move(state, field.derivative(machine, state), dt)
     return field.bound(machine, moved._replace(voltage=state.voltage))
 
 
-def _tensors(state: object) -> tuple[Tensor, ...]:
-    """The tensors of a NamedTuple state."""
+def _arrays(state: object) -> tuple[Array, ...]:
+    """The arrays of a NamedTuple state."""
     if not isinstance(state, tuple):
-        raise TypeError(f"the state of a vector field must be a NamedTuple of tensors, got {type(state).__name__}")
+        raise TypeError(f"the state of a vector field must be a NamedTuple of arrays, got {type(state).__name__}")
     return state

@@ -8,12 +8,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, NamedTuple
-
-import torch
-from torch import Generator, Tensor
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from memcomp_lightning import compiling, rng
+from memcomp_lightning.arrays import Array, alike, cast, double, namespace
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
 from memcomp_lightning.problems.graph import Bipartite, EdgeList
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
@@ -25,6 +23,9 @@ from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.kernels import reference
 from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start
 from memcomp_lightning.solvers.dmm.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
 
 log = logging.getLogger(__name__)
 
@@ -69,12 +70,12 @@ class DmmSolver:
             :func:`default_quench` of the problem.
         warm: How later groups begin; None draws new voltages with memories at rest.
         record: Records trajectories, for the time average and for plots; None does not.
-        kernel: "compiled" for the CPU, "reference" in plain torch for any device, field and integrator, or
-            "auto": compiled where it can be.
+        kernel: "compiled" for the CPU; "reference", plain operations on arrays, for any device, field and
+            integrator; or "auto": compiled where it can be.
 
-    >>> from memcomp_lightning import rng
-    >>> qubo = Qubo.from_matrix(torch.tensor([[1.0, -3.0], [0.0, 1.0]]))
-    >>> DmmSolver(max_steps=50).minimise(qubo, generator=rng.stream(0, "solver")).best_energy.item()
+    >>> import numpy as np
+    >>> qubo = Qubo.from_matrix(np.array([[1.0, -3.0], [0.0, 1.0]]))
+    >>> DmmSolver(max_steps=50).minimise(qubo, generator=np.random.default_rng(0)).best_energy.item()
     -1.0
     """
 
@@ -131,22 +132,22 @@ class DmmSolver:
             obstacle = self._obstacle("cpu")
             require(obstacle is None, "kernel", self.kernel, "'auto' or 'reference' here", obstacle or "")
 
-    def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: Generator) -> QuboSolution:
+    def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: "Generator") -> QuboSolution:
         """Return the best assignment of each restart.
 
         Args:
             problem: One or many problems of one shape, ``(*problems, ...)``.
-            generator: For the initial voltages and the noise.
+            generator: For the initial voltages and the noise, of numpy or torch.
         """
         begin = time.perf_counter() - compiling.seconds_spent()
         flat = _flatten(_without_zeros(problem))
-        n_problems, device = flat.offset.shape[0], flat.offset.device
+        n_problems, device, xp = flat.offset.shape[0], flat.offset.device, namespace(flat.offset)
         n_steps = self.max_steps or default_steps(flat)
         group_size = self.patience or self.n_restarts
         parts, shape = list[_Part](), (n_problems, self.n_restarts)
-        active = torch.arange(n_problems, device=device)
-        lowest = torch.full((n_problems,), torch.inf, dtype=torch.float64, device=device)
-        lowest_at = torch.zeros(n_problems, dtype=torch.int64, device=device)
+        active = xp.arange(n_problems, device=device)
+        lowest = xp.full((n_problems,), xp.inf, dtype=xp.float64, device=device)
+        lowest_at = xp.zeros_like(active)
         before: Run | None = None
         for done in range(0, self.n_restarts, group_size):
             group = slice(done, min(done + group_size, self.n_restarts))
@@ -158,54 +159,55 @@ class DmmSolver:
             parts.append(_Part(active, group, run, energies, visited))
             if group.stop == self.n_restarts:
                 break
-            found, at = energies.min(-1)
-            lowest_at[active] = torch.where(found < lowest[active], done + at, lowest_at[active])
-            lowest[active] = torch.minimum(found, lowest[active])
+            found, at = xp.min(energies, axis=-1), energies.argmin(-1)
+            lowest_at[active] = xp.where(found < lowest[active], done + at, lowest_at[active])
+            lowest[active] = xp.minimum(found, lowest[active])
             going_on = group.stop - 1 - lowest_at[active] < group_size
             active = active[going_on]
-            if not active.numel():
+            if not len(active):
                 break
             if self.warm is not None:
                 before = run._replace(voltage=run.voltage[going_on], kept=tuple(m[going_on] for m in run.kept))
 
-        def whole(pick: Callable[[_Part], Tensor], elsewhere: float = 0) -> Tensor:
+        def whole(pick: Callable[[_Part], Array], elsewhere: float = 0) -> Array:
             joined = _join([(part.problems, part.restarts, pick(part)) for part in parts], shape, elsewhere)
             return joined.reshape(*problem.problems, *joined.shape[1:])
 
         steps, found_at = whole(lambda part: part.run.steps), whole(lambda part: part.run.found_at)
-        status = torch.where(steps < n_steps, Status.STALLED, Status.STEP_BUDGET)
-        status = status.masked_fill(found_at > 0.9 * n_steps, Status.STILL_IMPROVING)
-        energies = whole(lambda part: part.energies, torch.inf)
+        status = xp.where(steps < n_steps, int(Status.STALLED), int(Status.STEP_BUDGET))
+        status = xp.where(found_at > 0.9 * n_steps, int(Status.STILL_IMPROVING), status)
+        energies = whole(lambda part: part.energies, xp.inf)
         trajectory = None
         if self.record is not None and parts[0].visited is not None:
             columns = range(len(Trajectory._fields))
             trajectory = Trajectory(*(whole(lambda part, k=k: part.visited[k]) for k in columns))  # type: ignore[misc]
         return QuboSolution(
-            assignments=whole(lambda part: part.run.best).to(start.voltage.dtype),
+            assignments=cast(whole(lambda part: part.run.best), start.voltage.dtype),
             energies=energies,
-            status=status.masked_fill(energies.isinf(), Status.NOT_RUN),
+            status=xp.where(energies == xp.inf, int(Status.NOT_RUN), status),
             steps=steps,
             wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
             trajectory=trajectory,
         )
 
     def _start(
-        self, problem: Qubo | WeightedMaxSat, n_restarts: int, before: Run | None, generator: Generator
+        self, problem: Qubo | WeightedMaxSat, n_restarts: int, before: Run | None, generator: "Generator"
     ) -> Start:
         """New voltages with memories at rest, or a kick to where the last restarts ended."""
         like = problem.linear if isinstance(problem, Qubo) else problem.unit
         shape = (problem.offset.shape[0], n_restarts)
         kick = 2 * rng.uniform((*shape, problem.n), generator=generator, like=like) - 1
-        seed = torch.randint(2**32, shape, generator=generator, device=generator.device).to(like.device)
+        seed = rng.integers(2**32, shape, generator=generator, like=like)
         if self.warm is None or before is None:
             return Start(self.field.spread * kick, (), seed)
-        voltage = (before.voltage.to(like.dtype) + self.warm.spread * kick).clamp(-1, 1)
+        voltage = (cast(before.voltage, like.dtype) + self.warm.spread * kick).clip(-1, 1)
         return Start(voltage, tuple(self.warm.keep * memory for memory in before.kept), seed)
 
     def _run(self, problem: Qubo | WeightedMaxSat, start: Start, n_steps: int) -> Run:
         """Run the kernel that the settings ask for."""
         integrator = self.integrator or self.field.integrator
-        obstacle = None if self.kernel == "reference" else self._obstacle(start.voltage.device.type)
+        device = getattr(start.voltage.device, "type", "cpu")
+        obstacle = None if self.kernel == "reference" else self._obstacle(device)
         kernel: Callable[..., Run] = reference.run
         if obstacle is not None:
             _say_once(obstacle)
@@ -229,15 +231,15 @@ class DmmSolver:
         """Why the compiled kernel cannot run, and what to do; None if it can."""
         integrator = self.integrator or self.field.integrator
         if device != "cpu":
-            return f"The problem is on {device}: the plain torch kernel runs there."
+            return f"The problem is on {device}: the plain kernel runs there."
         if importlib.util.find_spec("numba") is None:
-            return "numba is not installed: the plain torch kernel is many times slower. pip install numba"
+            return "numba is not installed: the plain kernel is many times slower. pip install numba"
         if (failure := _import_failure()) is not None:
             return failure
         from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS
 
         if type(self.field) not in FIELDS:
-            return f"{type(self.field).__name__} has no compiled kernel: the plain torch kernel integrates it."
+            return f"{type(self.field).__name__} has no compiled kernel: the plain kernel integrates it."
         if type(integrator) is not Splitting:
             return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
         return FIELDS[type(self.field)].obstacle(self.field)
@@ -246,10 +248,10 @@ class DmmSolver:
 class _Part(NamedTuple):
     """A group of restarts of the problems that were not done by then."""
 
-    problems: Tensor
+    problems: Array
     restarts: slice
     run: Run
-    energies: Tensor
+    energies: Array
     visited: Trajectory | None
 
 
@@ -282,9 +284,7 @@ def _import_failure() -> str | None:
     try:
         from memcomp_lightning.solvers.dmm.kernels import cpu  # noqa: F401
     except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
-        return (
-            f"numba: {error}. The plain torch kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
-        )
+        return f"numba: {error}. The plain kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
     return None
 
 
@@ -293,7 +293,7 @@ def _say_once(message: str) -> None:
     log.info(message)
 
 
-def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> Qubo | WeightedMaxSat:
+def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Array], Array]) -> Qubo | WeightedMaxSat:
     """Apply a change of the axes of problems to all tensors that have them."""
     if isinstance(problem, Qubo):
         return dataclasses.replace(
@@ -305,8 +305,8 @@ def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Tensor], Tensor]) -> 
     return dataclasses.replace(
         problem,
         weight=change(problem.weight),
-        first=change(problem.first.expand(problem.weight.shape)),
-        second=change(problem.second.expand(problem.weight.shape)),
+        first=change(namespace(problem.weight).broadcast_to(problem.first, problem.weight.shape)),
+        second=change(namespace(problem.weight).broadcast_to(problem.second, problem.weight.shape)),
         unit=change(problem.unit),
         offset=change(problem.offset),
         longer=tuple(dataclasses.replace(block, weight=change(block.weight)) for block in problem.longer),
@@ -317,13 +317,14 @@ def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
     """Turn two layers with few non-zero couplings into a list of pairs, which is faster to integrate."""
     if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
         return problem
-    if problem.coupling.count_nonzero() > _SPARSE * problem.coupling.numel():
-        return problem
-    used = (problem.coupling != 0).reshape(-1, *problem.graph.edge_shape).any(0).flatten()
-    if used.sum() > _SPARSE * used.numel():
-        return problem
     flat = problem.coupling.reshape(*problem.problems, -1)
-    pairs = problem.graph.edges().to(used.device)[used]
+    used = flat != 0
+    if used.sum() > _SPARSE * math.prod(flat.shape):
+        return problem
+    used = used.reshape(-1, flat.shape[-1]).any(0)
+    if used.sum() > _SPARSE * len(used):
+        return problem
+    pairs = alike(problem.graph.edges(), used)[used]
     return dataclasses.replace(problem, graph=EdgeList(n=problem.n, pairs=pairs), coupling=flat[..., used])
 
 
@@ -339,36 +340,40 @@ def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
     return _map(problem, lambda x: x.reshape(n_problems, *x.shape[axes:]))
 
 
-def _select(problem: Qubo | WeightedMaxSat, chosen: Tensor) -> Qubo | WeightedMaxSat:
+def _select(problem: Qubo | WeightedMaxSat, chosen: Array) -> Qubo | WeightedMaxSat:
     """Some of the problems on the leading axis."""
     return _map(problem, lambda x: x[chosen])
 
 
-def _trajectory(problem: Qubo | WeightedMaxSat, times: Tensor, states: Tensor) -> Trajectory:
+def _trajectory(problem: Qubo | WeightedMaxSat, times: Array, states: Array) -> Trajectory:
     """Add what the records weigh, from their states in float64, and how long each one stands."""
     n_problems, n_restarts = times.shape[:2]
     n_terms = math.prod(problem.graph.edge_shape) + problem.n
     if isinstance(problem, WeightedMaxSat):
-        n_terms += sum(block.variables.numel() for block in problem.longer)
+        n_terms += sum(math.prod(block.variables.shape) for block in problem.longer)
     # All records at once could need memory for records x terms.
     block = max(1, _MOST_TERMS // (n_problems * n_restarts * n_terms))
-    parts = (problem.energy(part.flatten(1, 2)) for part in states.split(block, dim=2))
-    energies = torch.cat([part.unflatten(-1, (n_restarts, -1)) for part in parts], dim=-1)
-    offset = from_qubo(problem).offset if isinstance(problem, Qubo) else problem.offset.double()
-    dwell = times.diff(dim=-1, prepend=torch.zeros_like(times[..., :1]))
-    return Trajectory(times, energies - offset[:, None, None], states, dwell)
+    xp, parts = namespace(times), []
+    for begin in range(0, states.shape[2], block):
+        part = states[:, :, begin : begin + block]
+        energies = problem.energy(part.reshape(n_problems, -1, part.shape[-1]))
+        parts.append(energies.reshape(part.shape[:-1]))
+    offset = from_qubo(problem).offset if isinstance(problem, Qubo) else double(problem.offset)
+    dwell = xp.concat((times[..., :1], times[..., 1:] - times[..., :-1]), axis=-1)
+    return Trajectory(times, xp.concat(parts, axis=-1) - offset[:, None, None], states, dwell)
 
 
 _MOST_TERMS = 2**22
 """Terms of energies that are held at once: 32 MiB in float64."""
 
 
-def _join(parts: list[tuple[Tensor, slice, Tensor]], shape: tuple[int, int], elsewhere: float) -> Tensor:
+def _join(parts: list[tuple[Array, slice, Array]], shape: tuple[int, int], elsewhere: float) -> Array:
     """What all groups returned, ``(n_problems, n_restarts, ...)``; ``elsewhere`` where no restart was run."""
     first = parts[0][2]
     if first.shape[:2] == shape:
         return first
-    joined = first.new_full((*shape, *first.shape[2:]), elsewhere)
+    xp = namespace(first)
+    joined = xp.full((*shape, *first.shape[2:]), elsewhere, dtype=first.dtype, device=first.device)
     for problems, restarts, values in parts:
         joined[problems, restarts] = values
     return joined

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from torch import Tensor
+from memcomp_lightning.arrays import Array, as_array, namespace
 
 
 class Trajectory(NamedTuple):
@@ -15,13 +15,15 @@ class Trajectory(NamedTuple):
         dwell: Machine time since the record before, its weight in a time average, same shape as ``time``.
     """
 
-    time: Tensor
-    unsatisfied_weight: Tensor
-    assignments: Tensor
-    dwell: Tensor
+    time: Array
+    unsatisfied_weight: Array
+    assignments: Array
+    dwell: Array
 
-    def weights(self) -> Tensor:
+    def weights(self) -> Array:
         """Of a time average that leaves out the start: ``dwell``, but 0 until the weight falls to its median."""
         weight = self.unsatisfied_weight
-        reached = (weight <= weight.median(-1, keepdim=True).values).cummax(-1).values
-        return self.dwell * reached
+        xp = namespace(weight)
+        median = xp.sort(weight, axis=-1)[..., (weight.shape[-1] - 1) // 2]
+        reached = xp.cumulative_sum(xp.astype(weight <= median[..., None], xp.int64), axis=-1) > 0
+        return self.dwell * as_array(reached)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood import (
     Ais,
@@ -17,7 +18,6 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import DBM, BoltzmannMachine, as_two_layers
 from memcomp_lightning.models.connectivity import grid
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, Exact, ExactPosterior, GroundState, MeanField
 from memcomp_lightning.solvers import BruteForce

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood import (
     cpu,
@@ -21,7 +22,6 @@ from memcomp_lightning.likelihood import (
 from memcomp_lightning.likelihood.layers import Layers, layers_of
 from memcomp_lightning.likelihood.prefixes import prefix_log_weights
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian, mean_field
 from memcomp_lightning.models.connectivity import colouring, from_graph, from_mask, from_pairs, full, grid, layered
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import Centring, contrast
 from memcomp_lightning.types import Configurations
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.models import chains
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.testing.conformance import small_rbm
 
 

@@ -16,10 +16,10 @@ from dwave.samplers import SimulatedAnnealingSampler, TabuSampler  # noqa: E402
 
 import memcomp_lightning  # noqa: E402
 from memcomp_lightning import rng  # noqa: E402
+from memcomp_lightning.enumeration import binary_states  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
 from memcomp_lightning.interop import DmmDimodSampler  # noqa: E402
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
-from memcomp_lightning.models.enumeration import binary_states  # noqa: E402
 from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noqa: E402
 from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
 from memcomp_lightning.solvers import BruteForce, DimodSolver, Status  # noqa: E402
@@ -47,10 +47,10 @@ def test_a_model_of_any_labels_as_a_problem_has_its_energies(vartype):
         {"c": 1.0, 3: -2.0, "a": 0.5}, {("a", 3): 2.0, ("c", "a"): -1.5}, 0.25, vartype
     )
     qubo, variables = from_bqm(bqm)
-    x = binary_states(3, like=torch.zeros(()))
+    x = binary_states(3, like=qubo.linear)
     values = x if vartype == "BINARY" else 2 * x - 1
-    expected = bqm.energies((values.numpy().astype(int), variables))
-    np.testing.assert_allclose(qubo.energy(x).numpy(), expected)
+    expected = bqm.energies((values.astype(int), variables))
+    np.testing.assert_allclose(qubo.energy(x), expected)
     with pytest.raises(SettingError, match="at least one variable"):
         from_bqm(dimod.BinaryQuadraticModel("SPIN"))
 

@@ -32,7 +32,7 @@ TAKES_CLAUSES = ("clauses", "reference")
 
 
 def seeds(name):
-    """The plain torch kernel takes many times as long as the others."""
+    """The plain kernel takes many times as long as the others."""
     return range(9 if name == "reference" else 36)
 
 
@@ -94,7 +94,7 @@ def test_clauses(tmp_path, name):
         if answer is None:
             continue
         lowest = min(cost(clauses, x) for x in itertools.product((0, 1), repeat=problem.n))
-        found = cost(clauses, answer.assignment.int().tolist())
+        found = cost(clauses, answer.assignment.astype(int).tolist())
         assert (answer.score.hard_unsatisfied, answer.score.value) == found, lines
         assert found[0] == lowest[0], f"feasibility ranks before cost:\n{lines}"
         assert answer.energy == min(energy for energy in answer.energies if energy is not None)
@@ -145,7 +145,7 @@ def test_sums(tmp_path, name, kind):
         answer = answer_of(name, problem, seed)
         sign = -1 if problem.objective.maximised else 1
         lowest = min(sign * value(kind, entries, constant, x) for x in itertools.product((0, 1), repeat=problem.n))
-        found = value(kind, entries, constant, answer.assignment.int().tolist())
+        found = value(kind, entries, constant, answer.assignment.astype(int).tolist())
         assert answer.score == (found, 0)
         assert answer.energy == sign * found
         if answer.optimal:

@@ -1,15 +1,19 @@
-"""Brute force and descent against all energies."""
+"""Brute force and descent against all energies; all solvers with numpy and with torch."""
 
 import dataclasses
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models.enumeration import binary_states
-from memcomp_lightning.problems import Bipartite, Qubo, from_model
+from memcomp_lightning.problems import Bipartite, Qubo, WeightedMaxSat, from_model
 from memcomp_lightning.solvers import AlternatingDescent, BranchAndBound, BruteForce, GibbsAnnealing, Status
+from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.testing.conformance import small_rbm
 
 
@@ -242,3 +246,82 @@ def test_branch_and_bound_searches_what_lies_a_step_below_its_descent(monkeypatc
 
 def test_branch_and_bound_proves_nothing_of_integers_that_float64_rounds():
     assert solve(BranchAndBound(), integer_layers(5, 3, -(2**54), 0)).status.tolist() == [Status.ROUNDED]
+
+
+# ------------------------------------------------------------------------------------------------ libraries
+
+
+def machine(field, kernel):
+    """Few steps: the libraries round differently, and the machines are chaotic."""
+    record, warm = Recording(every=3), WarmRestart()
+    return DmmSolver(
+        field=field, n_restarts=6, patience=3, max_steps=11, record=record, warm=warm, kernel=kernel, stall=None
+    )
+
+
+SOLVERS = {
+    "brute force": BruteForce(),
+    "branch and bound": BranchAndBound(),
+    "descent": AlternatingDescent(n_restarts=7),
+    "annealing": GibbsAnnealing(n_restarts=7, n_sweeps=5),
+    "clauses, compiled": machine(ClauseField(), "compiled"),
+    "clauses, reference": machine(ClauseField(), "reference"),
+    "bonds, compiled": machine(BondField(), "compiled"),
+    "bonds, reference": machine(BondField(), "reference"),
+}
+
+
+LITERALS = [[1, 2, 3], [-1, 4, -5], [2, -3, 6, 7], [-2, -4], [5, -6], [-7], [3, 5], [-3, -6, 1]]
+CLAUSES = WeightedMaxSat.from_clauses(7, LITERALS, [1.0, 2.0, 1.5, 0.7, 0.4, 0.3, 1.0, 0.9])
+EVERY = PROBLEMS | {"MAX-SAT": CLAUSES.alike(torch.zeros(()))}
+
+
+def takes(solver, problem):
+    if isinstance(problem, WeightedMaxSat):
+        return isinstance(solver, DmmSolver) and isinstance(solver.field, ClauseField)
+    return isinstance(problem.graph, Bipartite) or not isinstance(solver, BranchAndBound)
+
+
+@pytest.mark.parametrize("draws", [rng.stream, rng.numpy_stream], ids=["draws of torch", "draws of numpy"])
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [(name, problem) for name in SOLVERS for problem in EVERY if takes(SOLVERS[name], EVERY[problem])],
+)
+def test_the_same_problem_in_numpy_and_in_torch_has_the_same_answer(name, problem, draws):
+    given = EVERY[problem]
+    ours, theirs = (
+        SOLVERS[name].minimise(one, generator=draws(0, "solver")) for one in (given.alike(np.zeros(())), given)
+    )
+    for field in ("assignments", "energies", "status", "steps", "best", "best_energy"):
+        a, b = getattr(ours, field), getattr(theirs, field)
+        assert isinstance(a, np.ndarray | np.generic)
+        assert isinstance(b, torch.Tensor)
+        rounding = 1e-12 if "energ" in field else 0
+        np.testing.assert_allclose(a, b.numpy(), rtol=rounding, atol=rounding, strict=True)
+    assert (ours.trajectory is None) == (theirs.trajectory is None)
+    for a, b in zip(ours.trajectory or (), theirs.trajectory or (), strict=True):
+        assert isinstance(a, np.ndarray)
+        np.testing.assert_allclose(a, b.numpy(), rtol=1e-4, atol=1e-4, strict=True)
+
+
+WITHOUT_TORCH = """
+import sys
+import numpy as np
+import memcomp_lightning.problems, memcomp_lightning.solvers, memcomp_lightning.solvers.dmm
+from memcomp_lightning.problems import Qubo
+from memcomp_lightning.solvers import BruteForce, GibbsAnnealing
+from memcomp_lightning.solvers.dmm import DmmSolver
+
+qubo = Qubo.from_matrix(np.random.default_rng(0).normal(size=(5, 5)))
+solvers = BruteForce(), GibbsAnnealing(), DmmSolver(), DmmSolver(kernel="reference")
+print(*(solver.minimise(qubo, generator=np.random.default_rng(1)).best_energy for solver in solvers))
+assert "torch" not in sys.modules
+"""
+
+
+def test_problems_in_numpy_are_solved_without_torch():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lowest, *others = map(float, done.stdout.split())
+    assert others == pytest.approx([lowest] * 3)
+    assert lowest < 0

@@ -7,6 +7,7 @@ import torch
 from scipy import stats
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood import (
     Ais,
@@ -18,7 +19,6 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
 )
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.testing.conformance import small_rbm
 
 SIZES = pytest.mark.parametrize("sizes", [(7, 5), (5, 7)], ids=str)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.samplers import CD, PCD, ClampedGibbs, MeanField, ParallelTempering
 from memcomp_lightning.testing import chi_square_p_value, small_dbm, small_machine, state_counts
 

@@ -11,8 +11,8 @@ import torch
 from scipy import stats
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.samplers import CD, PCD, Quench, positive_phase
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm

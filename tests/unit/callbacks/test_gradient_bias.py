@@ -9,9 +9,9 @@ import torch
 from foreign import TheirChains, TheirRBM, fit
 
 from memcomp_lightning.callbacks import GradientBias
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM, Gaussian
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import Exact, positive_phase
 from memcomp_lightning.types import NoState

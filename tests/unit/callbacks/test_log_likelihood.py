@@ -8,10 +8,10 @@ from foreign import IMAGES, TheirChains, TheirRBM, fit
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import LogLikelihood
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.metrics import MeanLogLikelihood, MeanLogPseudoLikelihood
 from memcomp_lightning.models import RBM, Gaussian
-from memcomp_lightning.models.enumeration import binary_states
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*does not have many workers.*")
 fits = pytest.mark.usefixtures("allow_global_rng")  # torch's DataLoader draws a base seed

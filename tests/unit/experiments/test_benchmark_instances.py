@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.solvers import BruteForce
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_benchmark"))

@@ -9,8 +9,8 @@ pytest.importorskip("dwave.samplers")
 pytest.importorskip("simulated_bifurcation")
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models.enumeration import binary_states
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_benchmark"))
 from instances import beasley, random_max_sat, random_rbm

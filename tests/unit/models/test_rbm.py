@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.testing.conformance import small_rbm
 from memcomp_lightning.types import Configurations

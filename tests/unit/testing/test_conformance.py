@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers import (

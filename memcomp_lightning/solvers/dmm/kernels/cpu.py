@@ -1,4 +1,4 @@
-"""The compiled kernels: hand tensors to numba and share the restarts among threads."""
+"""The compiled kernels: hand arrays to numba and share the restarts among threads."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numba import njit
-from torch import Tensor
 
-from memcomp_lightning.compiling import announce_compilation
+from memcomp_lightning.arrays import AnyArray, Array, alike, to_numpy
+from memcomp_lightning.compiling import announce_compilation, n_threads
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
@@ -30,7 +29,7 @@ from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start, Visited
 
 announce_compilation()
 
-Array = np.ndarray[Any, Any]
+Numbers = np.ndarray[Any, Any]
 Steps = tuple[int, int, int, int, float]
 
 
@@ -46,7 +45,7 @@ def run(
     stall: Stall | None = None,
     remember: bool = True,
 ) -> Run:
-    """Do what ``reference.run`` does, for tensors on the CPU, in float32."""
+    """Do what ``reference.run`` does, on the CPU and in float32."""
     every = recording.every if recording is not None else 0
     min_steps, factor = (n_steps, 0.0) if stall is None or every else stall
     steps = (n_steps, quench_every, every, min_steps, float(factor))
@@ -78,7 +77,7 @@ def _run_rows(
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
     control[:, common.CHANGE] *= np.sqrt(n / (width + height))
     voltage = _pad(_array(start.voltage), n_first, width, width + height)
-    kept: list[Array] = [_array(memory) for memory in start.kept]
+    kept: list[Numbers] = [_array(memory) for memory in start.kept]
     if kept:
         matrix = kept[0].reshape(n_problems, n_restarts * n_second, n_first)
         matrix = _pad(matrix, n_first, width, width).reshape(n_problems, n_restarts, n_second * width)
@@ -92,17 +91,17 @@ def _run_rows(
     work = padded.weight.size * n_restarts * steps[0]
     _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
 
-    def unpad(x: Array) -> Array:
+    def unpad(x: Numbers) -> Numbers:
         return np.concatenate((x[..., :n_first], x[..., width : width + n_second]), axis=-1)
 
     memories = []
     if remember:
         of_pairs = kept[0].reshape(n_problems, n_restarts, n_second, width)
         memories = [np.ascontiguousarray(of_pairs[..., :n_first]), unpad(kept[1])]
-    return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps)
+    return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps, start.voltage)
 
 
-def _pad(x: Array, n_first: int, width: int, size: int) -> Array:
+def _pad(x: Numbers, n_first: int, width: int, size: int) -> Numbers:
     """Move what is behind ``n_first`` on the last axis to behind ``width``; zeros elsewhere."""
     padded = np.zeros((*x.shape[:-1], size), np.float32)
     padded[..., :n_first] = x[..., :n_first]
@@ -115,13 +114,13 @@ class _Prepared(NamedTuple):
 
     kind: int
     sizes: tuple[int, int, int, int]
-    side: Array
-    scalars: Array
-    weight: Array
-    unit: Array
-    coupling: Array
-    transposed: Array
-    linear: Array
+    side: Numbers
+    scalars: Numbers
+    weight: Numbers
+    unit: Numbers
+    coupling: Numbers
+    transposed: Numbers
+    linear: Numbers
 
 
 def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
@@ -133,7 +132,7 @@ def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
     unit, linear = (np.zeros((n_problems, width + height), np.float32) for _ in range(2))
     scalars = np.empty((n_problems, 3))
     kind = BOND if isinstance(field, BondField) else 1 - BOND
-    given = [np.ascontiguousarray(x.detach().double().numpy()) for x in (problem.coupling, problem.linear)]
+    given = [np.ascontiguousarray(to_numpy(x), np.float64) for x in (problem.coupling, problem.linear)]
     _forget_outdated(prepare)
     compiled: Any = prepare
     compiled(kind, width, height, *given, weight, unit, scalars, coupling, transposed, linear)
@@ -169,7 +168,7 @@ def _run_lanes(
     _share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
     out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
     final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
-    return _finish(out, final[0], final[1:], steps)
+    return _finish(out, final[0], final[1:], steps, start.voltage)
 
 
 @cache
@@ -181,20 +180,20 @@ def _of_this_process() -> Any:
 class _Sparse(NamedTuple):
     """A problem as the lanes kernel reads it."""
 
-    pairs: Array
-    weight: Array
-    polarity: Array
-    unit: Array
-    variables: Array
-    longer_polarity: Array
-    longer_weight: Array
-    digital: tuple[Array, ...]
-    linear: Array
+    pairs: Numbers
+    weight: Numbers
+    polarity: Numbers
+    unit: Numbers
+    variables: Numbers
+    longer_polarity: Numbers
+    longer_weight: Numbers
+    digital: tuple[Numbers, ...]
+    linear: Numbers
 
 
 def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> _Sparse:
     """Flatten a problem and list, for each variable, its pairs and its longer clauses."""
-    pairs = np.ascontiguousarray(problem.graph.edges().cpu().numpy())
+    pairs = np.ascontiguousarray(to_numpy(problem.graph.edges()))
     n, n_pairs = problem.n, pairs.shape[0]
     polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
     if listed.polarity is not None:
@@ -202,7 +201,7 @@ def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> 
     variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
     longer_weight = np.zeros((n_problems, 0), np.float32)
     if listed.longer is not None:
-        variables = listed.longer[0].numpy()
+        variables = to_numpy(listed.longer[0])
         longer_polarity, longer_weight = (_array(x) for x in listed.longer[1:])
     if isinstance(problem, Qubo):
         quadratic, block_weights = problem, []
@@ -212,7 +211,7 @@ def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> 
     coupling, linear, clause_weight = _digital(
         quadratic.coupling.reshape(n_problems, n_pairs),
         quadratic.linear,
-        torch.cat(block_weights or [quadratic.linear[:, :0]], dim=-1),
+        np.concatenate([to_numpy(block) for block in block_weights or [quadratic.linear[:, :0]]], axis=-1),
     )
     ends = np.concatenate((pairs[:, 0], pairs[:, 1]))
     order, offsets = _sorted(ends, n)
@@ -234,13 +233,13 @@ def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> 
     )
 
 
-def _sorted(variable: Array, n: int) -> tuple[Array, Array]:
+def _sorted(variable: Numbers, n: int) -> tuple[Numbers, Numbers]:
     """Order that groups entries by variable, and where each variable's group begins, ``(n + 1,)``."""
     counts = np.bincount(variable, minlength=n)
     return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
 
 
-def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Mapping[str, Any]) -> Array:
+def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Mapping[str, Any]) -> Numbers:
     """Settings of the field as its passes read them, a row a problem; 0 where the field has none of a name."""
     constants = np.zeros((n_problems, len(names)), np.float32)
     for index, name in enumerate(names):
@@ -249,7 +248,7 @@ def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Ma
     return constants
 
 
-def _control(field: Any, integrator: Splitting, stability: Array) -> Array:
+def _control(field: Any, integrator: Splitting, stability: Numbers) -> Numbers:
     """The step control as the kernels read it, a row a problem."""
     limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
     control = np.tile(np.array(limits, np.float32), (len(stability), 1))
@@ -257,24 +256,24 @@ def _control(field: Any, integrator: Splitting, stability: Array) -> Array:
     return control
 
 
-def _digital(*parts: Tensor) -> tuple[Array, ...]:
+def _digital(*parts: AnyArray) -> tuple[Numbers, ...]:
     """Parts of the energy over a power of two a problem, so that float32 holds them and integers stay exact."""
-    sizes = [part.abs().flatten(1).double() for part in parts if part.numel()]
-    largest = torch.stack([size.amax(1) for size in sizes]).amax(0)
-    scale = torch.exp2(torch.frexp(largest.clamp(min=1e-300)).exponent.double())
-    return tuple(_array(part / scale.reshape(-1, *(1,) * (part.ndim - 1))) for part in parts)
+    numbers = [to_numpy(part) for part in parts]
+    largest = np.max([np.abs(part).reshape(len(part), -1).max(1, initial=1e-300) for part in numbers], axis=0)
+    scale = np.exp2(np.frexp(largest)[1])
+    return tuple(_array(part / scale.reshape(-1, *(1,) * (part.ndim - 1))) for part in numbers)
 
 
-def _array(x: Tensor) -> Array:
-    """A tensor as a contiguous float32 array."""
-    return np.ascontiguousarray(x.detach().to(torch.float32).numpy())
+def _array(x: AnyArray) -> Numbers:
+    """A contiguous float32 array."""
+    return np.ascontiguousarray(to_numpy(x), np.float32)
 
 
-def _seeds(seed: Tensor) -> Array:
-    return seed.numpy().astype(np.uint64)
+def _seeds(seed: Array) -> Numbers:
+    return to_numpy(seed).astype(np.uint64)
 
 
-def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Array, ...]:
+def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Numbers, ...]:
     """Best assignment, its step, the last step, record times and states."""
     n_records = steps[0] // steps[2] if steps[2] else 0
     return (
@@ -286,11 +285,12 @@ def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Array, ..
     )
 
 
-def _finish(out: tuple[Array, ...], voltage: Array, memories: list[Array], steps: Steps) -> Run:
-    best, found_at, last, times, states = (torch.from_numpy(np.ascontiguousarray(x)) for x in out)
-    kept = tuple(torch.from_numpy(memory) for memory in memories)
+def _finish(out: tuple[Numbers, ...], voltage: Numbers, memories: list[Numbers], steps: Steps, like: Array) -> Run:
+    """The outcome as arrays of the library of the start."""
+    best, found_at, last, times, states = (alike(np.ascontiguousarray(x), like) for x in out)
+    kept = tuple(alike(memory, like) for memory in memories)
     visited = Visited(times, states) if steps[2] else None
-    return Run(best > 0.5, found_at, last, torch.from_numpy(voltage), kept, visited)
+    return Run(best > 0.5, found_at, last, alike(voltage, like), kept, visited)
 
 
 def _blocks(n_restarts: int) -> tuple[int, int]:
@@ -309,14 +309,14 @@ _MOST_LANES = 32
 """Enough to hide the cost of a loop over the lanes, few enough to keep a variable's numbers close together."""
 
 
-def _to_lanes(x: Array, n_blocks: int, lanes_each: int) -> Array:
+def _to_lanes(x: Numbers, n_blocks: int, lanes_each: int) -> Numbers:
     """``(n_problems, n_restarts, size)`` as ``(n_problems, n_blocks, size, lanes_each)``."""
     restart = np.arange(n_blocks * lanes_each) % x.shape[1]
     blocks = x[:, restart].reshape(x.shape[0], n_blocks, lanes_each, x.shape[2])
     return np.ascontiguousarray(blocks.transpose(0, 1, 3, 2))
 
 
-def _from_lanes(x: Array, n_restarts: int) -> Array:
+def _from_lanes(x: Numbers, n_restarts: int) -> Numbers:
     """The inverse of :func:`_to_lanes`."""
     flat = x.transpose(0, 1, 3, 2).reshape(x.shape[0], x.shape[1] * x.shape[3], x.shape[2])
     return np.ascontiguousarray(flat[:, :n_restarts])
@@ -333,21 +333,21 @@ if hasattr(os, "register_at_fork"):
 
 
 def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -> None:
-    """Run items 0 to ``n_items - 1`` on as many threads as torch uses; ``work`` counts pairs x steps x restarts.
+    """Run items 0 to ``n_items - 1`` on as many threads as there are; ``work`` counts pairs x steps x restarts.
 
     Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
     """
     if kernel.stats.cache_path is not None:
         _forget_outdated(kernel)
     stop = np.zeros(1, np.uint8)
-    n_threads = min(torch.get_num_threads(), n_items)
-    if n_threads <= 1 and work < _SHORT:
+    most = min(n_threads(), n_items)
+    if most <= 1 and work < _SHORT:
         kernel(0, n_items, stop, *arguments)
         return
     if not kernel.signatures:
         kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
-    cuts = np.linspace(0, n_items, min(n_items, 4 * n_threads) + 1).astype(int).tolist()
-    jobs = [_pool(n_threads).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
+    cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
+    jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
     try:
         for job in jobs:
             job.result()

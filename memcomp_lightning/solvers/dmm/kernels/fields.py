@@ -3,9 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
+from memcomp_lightning.arrays import Array, namespace
 from memcomp_lightning.solvers.dmm.bond import BondField
 from memcomp_lightning.solvers.dmm.clause import ClauseField, ClauseMachine
 from memcomp_lightning.solvers.dmm.kernels import lanes
@@ -22,10 +20,10 @@ class Listed(NamedTuple):
         longer: Variables, polarities and weights of longer clauses; None where there are none.
     """
 
-    weight: Tensor
-    unit: Tensor
-    polarity: Tensor | None = None
-    longer: tuple[Tensor, Tensor, Tensor] | None = None
+    weight: Array
+    unit: Array
+    polarity: Array | None = None
+    longer: tuple[Array, Array, Array] | None = None
 
 
 class Compiled(NamedTuple):
@@ -55,7 +53,7 @@ class Compiled(NamedTuple):
     kind: Any
     constants: tuple[str, ...]
     listed: Callable[[Any], Listed]
-    of_problem: Callable[[Any, Any], Mapping[str, Tensor]]
+    of_problem: Callable[[Any, Any], Mapping[str, Array]]
     start: Any
     advance: Any
     obstacle: Callable[[Any], str | None] = lambda field: None
@@ -74,10 +72,10 @@ class Bonds(NamedTuple):
 
 
 def _listed_clauses(machine: ClauseMachine) -> Listed:
-    polarity = torch.stack(
-        [q.expand(machine.weight.shape).flatten(1) for q in (machine.first, machine.second)], -1
-    )
-    longer = (machine.longer_variables, machine.longer_polarity, machine.longer_weight.squeeze(-2))
+    xp, shape = namespace(machine.weight), machine.weight.shape
+    both = [xp.broadcast_to(q, shape).reshape(shape[0], -1) for q in (machine.first, machine.second)]
+    polarity = xp.stack(both, axis=-1)
+    longer = (machine.longer_variables, machine.longer_polarity, machine.longer_weight[..., 0, :])
     return Listed(machine.weight, machine.unit, polarity, longer)
 
 

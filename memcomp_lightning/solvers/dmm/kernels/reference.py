@@ -1,10 +1,10 @@
-"""The readable kernel: plain torch on any device, any field and integrator, all restarts in one program."""
+"""The readable kernel: plain operations on arrays; any device, field and integrator, all restarts at once."""
 
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from memcomp_lightning.arrays import Array, cast, namespace
 from memcomp_lightning.problems.maxsat import WeightedMaxSat
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import descend
@@ -16,6 +16,7 @@ MAX_SWEEPS = 1000
 """Ends a quench that rounding errors would keep alternating between equal energies."""
 
 
+@np.errstate(divide="ignore")  # the step of a machine at rest is the longest
 def run(
     field: VectorField[Any, Any],
     integrator: Integrator,
@@ -47,28 +48,28 @@ def run(
     state = _warmed(field.init(machine, start.voltage), start.kept)
     best = state.voltage > 0
     best_energy = problem.energy(best)
-    found_at = torch.zeros(best_energy.shape, dtype=torch.int64, device=best.device)
-    running = torch.ones_like(found_at, dtype=torch.bool)
-    steps = torch.zeros_like(found_at)
-    time = torch.zeros_like(best_energy)
-    before: Tensor | None = None
-    times: list[Tensor] = []
-    states: list[Tensor] = []
+    xp = namespace(best_energy)
+    found_at = xp.zeros_like(best_energy, dtype=xp.int64)
+    running = xp.ones_like(best_energy, dtype=xp.bool)
+    steps, time = xp.zeros_like(found_at), xp.zeros_like(best_energy)
+    before: Array | None = None
+    times: list[Array] = []
+    states: list[Array] = []
     for step in range(n_steps + 1):
         if step > 0:
             shake = _shake(field.noise, start.seed, step - 1)
             moved, dt, before = integrator.step(field, machine, state, before=before, shake=shake)
             state = moved if stall is None else _where(running, moved, state)
-            steps, time = steps + running.long(), time + dt
+            steps, time = steps + cast(running, xp.int64), time + dt
         x = state.voltage > 0
         if quench_every == 0 or step % quench_every == 0:
             # A descent ends at or below its start: its end alone need be compared.
             candidate = quench(problem, x) if quench_every else x
             energy = problem.energy(candidate)
             better = energy < best_energy
-            best = torch.where(better.unsqueeze(-1), candidate, best)
-            best_energy = torch.minimum(energy, best_energy)
-            found_at = torch.where(better, step, found_at)
+            best = xp.where(better[..., None], candidate, best)
+            best_energy = xp.minimum(energy, best_energy)
+            found_at = xp.where(better, step, found_at)
             if stall is not None:
                 running &= step < stall.min_steps + stall.factor * found_at
                 if step % (quench_every * rounds or rounds) == 0 and not running.any():
@@ -76,37 +77,37 @@ def run(
         if recording is not None and step > 0 and step % recording.every == 0:
             times.append(time)
             states.append(x)
-    visited = Visited(torch.stack(times, dim=-1), torch.stack(states, dim=-2)) if times else None
+    visited = Visited(xp.stack(times, axis=-1), xp.stack(states, axis=-2)) if times else None
     return Run(best, found_at, steps, state.voltage, _long_term(state) if remember else (), visited)
 
 
-def quench(problem: Qubo | WeightedMaxSat, x: Tensor) -> Tensor:
+def quench(problem: Qubo | WeightedMaxSat, x: Array) -> Array:
     """Flip variables as long as that lowers the energy; bool in, bool out.
 
     A QUBO is descended by blocks of uncoupled variables, MAX-SAT by the steepest single flips.
     """
-    x = x.to(problem.linear.dtype if isinstance(problem, Qubo) else torch.float64)
+    xp = namespace(x)
+    x = cast(x, problem.linear.dtype if isinstance(problem, Qubo) else xp.float64)
     rounds = _rounds(x)
     for sweep in range(MAX_SWEEPS):
-        before = x.clone()
+        before = xp.asarray(x, copy=True)
         if isinstance(problem, Qubo):
             descend(problem, x)
         else:
             gain = (1 - 2 * x) * problem.field(x)
-            lowest, at = gain.min(-1, keepdim=True)
-            flipped = x.scatter(-1, at, 1 - x.gather(-1, at))
-            x = torch.where(lowest < 0, flipped, x)
-        if (sweep + 1) % rounds == 0 and torch.equal(x, before):
+            at = gain.argmin(-1)[..., None] == xp.arange(x.shape[-1], device=x.device)
+            x = xp.where(at & (gain < 0), 1 - x, x)
+        if (sweep + 1) % rounds == 0 and bool((x == before).all()):
             break
     return x > 0.5
 
 
-def _rounds(like: Tensor) -> int:
+def _rounds(like: Array) -> int:
     """Rounds between two checks for the end: off the CPU each check makes Python wait for the device."""
-    return 1 if like.device.type == "cpu" else 8
+    return 1 if getattr(like.device, "type", "cpu") == "cpu" else 8
 
 
-def uniform(seed: Tensor, counter: Tensor) -> Tensor:
+def uniform(seed: Array, counter: Array) -> Array:
     """Numbers in [-1, 1) that depend on nothing but the arguments: a hash of both (Murmur3's finaliser)."""
     word = 0xFFFFFFFF
     z = (seed + counter * 0x9E3779B9) & word
@@ -116,36 +117,36 @@ def uniform(seed: Tensor, counter: Tensor) -> Tensor:
     return (z >> 8) * 2.0**-23 - 1
 
 
-def _shake(noise: float, seed: Tensor, step: int) -> Shake:
+def _shake(noise: float, seed: Array, step: int) -> Shake:
     """The noise of one step on the voltages."""
     if noise == 0:
         return still
 
-    def shake(state: Any, dt: Tensor) -> Any:
+    def shake(state: Any, dt: Array) -> Any:
         n = state.voltage.shape[-1]
-        counter = step * n + torch.arange(n, device=seed.device)
-        kick = uniform(seed.unsqueeze(-1), counter).to(state.voltage.dtype)
-        return state._replace(voltage=state.voltage + noise * dt.sqrt().unsqueeze(-1) * kick)
+        counter = step * n + namespace(seed).arange(n, device=seed.device)
+        kick = cast(uniform(seed[..., None], counter), state.voltage.dtype)
+        return state._replace(voltage=state.voltage + noise * (dt**0.5)[..., None] * kick)
 
     return shake
 
 
-def _where(running: Tensor, moved: Any, state: Any) -> Any:
+def _where(running: Array, moved: Any, state: Any) -> Any:
     """The restarts that are running have moved, the others have not."""
     return type(state)(
         *(
-            torch.where(running.reshape(*running.shape, *(1,) * (new.ndim - running.ndim)), new, old)
+            namespace(new).where(running.reshape(*running.shape, *(1,) * (new.ndim - running.ndim)), new, old)
             for new, old in zip(moved, state, strict=True)
         )
     )
 
 
-def _warmed(state: Any, kept: tuple[Tensor, ...]) -> Any:
+def _warmed(state: Any, kept: tuple[Array, ...]) -> Any:
     """The state with long-term memories that were kept."""
     names = [name for name in state._fields if name.endswith("long_term")]
     return state._replace(**{name: 1 + memory for name, memory in zip(names, kept, strict=False)})
 
 
-def _long_term(state: Any) -> tuple[Tensor, ...]:
+def _long_term(state: Any) -> tuple[Array, ...]:
     """Long-term memories less their rest value."""
     return tuple(getattr(state, name) - 1 for name in state._fields if name.endswith("long_term"))

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from torch import Tensor
+from memcomp_lightning.arrays import Array
 
 
 class Visited(NamedTuple):
@@ -13,8 +13,8 @@ class Visited(NamedTuple):
         states: ``(n_problems, n_restarts, n_records, n)`` bool.
     """
 
-    time: Tensor
-    states: Tensor
+    time: Array
+    states: Array
 
 
 class Start(NamedTuple):
@@ -27,9 +27,9 @@ class Start(NamedTuple):
         seed: Of the noise, ``(n_problems, n_restarts)`` int64 in [0, 2^32).
     """
 
-    voltage: Tensor
-    kept: tuple[Tensor, ...]
-    seed: Tensor
+    voltage: Array
+    kept: tuple[Array, ...]
+    seed: Array
 
 
 class Stall(NamedTuple):
@@ -58,9 +58,9 @@ class Run(NamedTuple):
         visited: The records, if asked for.
     """
 
-    best: Tensor
-    found_at: Tensor
-    steps: Tensor
-    voltage: Tensor
-    kept: tuple[Tensor, ...]
+    best: Array
+    found_at: Array
+    steps: Array
+    voltage: Array
+    kept: tuple[Array, ...]
     visited: Visited | None

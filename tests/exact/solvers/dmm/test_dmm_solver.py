@@ -8,13 +8,14 @@ import math
 import resource
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
-from memcomp_lightning.models.enumeration import binary_states
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.problems import Qubo, WeightedMaxSat, from_model, from_qubo
 from memcomp_lightning.samplers import CD, PCD, GroundState, positive_phase
@@ -509,7 +510,7 @@ def test_without_numba_the_readable_kernel_runs_and_says_so_once(caplog):
     first, again = (solve(DmmSolver(n_restarts=5, max_steps=23), qubo) for _ in range(2))
     plain = solve(DmmSolver(n_restarts=5, max_steps=23, kernel="reference"), qubo)
     assert [record.message for record in caplog.records if "pip install numba" in record.message] == [
-        "numba is not installed: the plain torch kernel is many times slower. pip install numba"
+        "numba is not installed: the plain kernel is many times slower. pip install numba"
     ]
     for solution in (first, again):
         assert solution.assignments.equal(plain.assignments)
@@ -569,9 +570,9 @@ def test_finds_the_optimum_of_maxsat(name, quench_every, kernel):
     problem = WeightedMaxSat.from_clauses(n, *clauses(n, lengths, seed=1), offset=0.7)
     solution = solve(DmmSolver(max_steps=307, quench_every=quench_every, kernel=kernel), problem)
     levels = problem.energy(binary_states(n, like=problem.unit))
-    highest = levels.quantile(0.01) if quench_every == 0 else levels.min() + 1e-12
+    highest = np.quantile(levels, 0.01) if quench_every == 0 else levels.min() + 1e-12
     assert levels.min() - 1e-12 <= solution.best_energy <= highest
-    assert solution.energies.equal(problem.energy(solution.assignments))
+    assert np.array_equal(solution.energies, problem.energy(solution.assignments))
     assert solution.assignments.dtype == problem.unit.dtype
 
 
@@ -585,7 +586,7 @@ def test_bonds_find_the_optimum_of_maxsat_with_two_literals(kernel):
 
 @either_kernel
 def test_maxsat_problems_of_one_shape_are_solved_together(kernel):
-    one = WeightedMaxSat.from_clauses(9, *clauses(9, {1: 4, 2: 12, 3: 20, 4: 8}, seed=3))
+    one = WeightedMaxSat.from_clauses(9, *clauses(9, {1: 4, 2: 12, 3: 20, 4: 8}, seed=3)).alike(torch.zeros(()))
     factor = rng.uniform((2, 3, 1), generator=rng.stream(0, "weights"))
     many = dataclasses.replace(
         one,

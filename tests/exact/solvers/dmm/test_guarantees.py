@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models.enumeration import binary_states
+from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
 from memcomp_lightning.solvers import BruteForce, Status
 from memcomp_lightning.solvers.dmm import (
@@ -117,7 +117,7 @@ def problems():
 def clauses():
     literals = [[1, 2, 3], [-1, 4, 5], [2, -5, 6, -1], [-3, -4, -6], [1, 2], [-2, 7], [3], [-7], [1, 2, 3], []]
     weights = (0.5 + uniform(10, seed=1)).tolist()
-    return {
+    made = {
         "clauses": WeightedMaxSat.from_clauses(8, literals, weights),
         "wild clauses": WeightedMaxSat.from_clauses(8, literals, wild(10, seed=2).abs().tolist()),
         "clauses of no weight": WeightedMaxSat.from_clauses(8, literals, [0.0] * 10),
@@ -125,6 +125,7 @@ def clauses():
         "no clauses": WeightedMaxSat.from_clauses(3, [], []),
         "longer clauses alone": WeightedMaxSat.from_clauses(6, literals[:4], weights[:4]),
     }
+    return {name: problem.alike(torch.zeros(())) for name, problem in made.items()}
 
 
 PROBLEMS, CLAUSES = problems(), clauses()

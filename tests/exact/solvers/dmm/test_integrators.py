@@ -333,7 +333,7 @@ def test_state_that_is_no_named_tuple_is_refused():
         def derivative(self, machine, state):
             return Loose()
 
-    with pytest.raises(TypeError, match="must be a NamedTuple of tensors, got Loose"):
+    with pytest.raises(TypeError, match="must be a NamedTuple of arrays, got Loose"):
         AdaptiveEuler().step(LooseField(), None, Loose())
 
 

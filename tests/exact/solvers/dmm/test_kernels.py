@@ -383,7 +383,7 @@ def test_same_success_after_many_steps(field, problem):
 
 def as_list(qubo):
     """The same problem with its pairs listed."""
-    graph = EdgeList(n=qubo.n, pairs=qubo.graph.edges())
+    graph = EdgeList(n=qubo.n, pairs=torch.as_tensor(qubo.graph.edges()))
     return Qubo(graph, qubo.coupling.flatten(-2), qubo.linear, qubo.offset)
 
 
@@ -394,7 +394,7 @@ def as_listed_maxsat(qubo):
         key: getattr(clauses, key).expand(clauses.weight.shape).flatten(-2)
         for key in ("weight", "first", "second")
     }
-    return dataclasses.replace(clauses, graph=EdgeList(n=qubo.n, pairs=qubo.graph.edges()), **flat)
+    return dataclasses.replace(clauses, graph=as_list(qubo).graph, **flat)
 
 
 @pytest.mark.parametrize("name", ["bipartite 17 + 11", "bipartite 11 + 17", "one bipartite"])

@@ -157,7 +157,7 @@ def test_an_offset_is_counted_and_said(write, offset, vartype):
     problem, plain = read_problem(path), read_problem(write("b.coo", f"# vartype={vartype}\n0 1 -2\n"))
     for x in states(2):
         assert problem.score(x).value == plain.score(x).value + 42
-    assert torch.equal(problem.problem.energy(states(2)), plain.problem.energy(states(2)) + 42)
+    assert np.array_equal(problem.problem.energy(states(2)), plain.problem.energy(states(2)) + 42)
     assert "is counted" in problem.remarks[0]
 
 
@@ -219,7 +219,7 @@ def test_unused_variables_cost_nothing(write):
     assert (problem.n, problem.problem.n, problem.n_unused) == (9_999_999, 2, 9_999_997)
     solution = BruteForce().minimise(problem.problem, generator=rng.stream(0, "solver"))
     answer = Answer.of(problem, solution)
-    assert answer.assignment.nonzero().flatten().tolist() == [0, 9_999_998]
+    assert np.flatnonzero(answer.assignment).tolist() == [0, 9_999_998]
     assert (answer.score, answer.optimal) == ((-1, 0), True)
     assert problem.score(answer.assignment) == problem.score(solution.best)
     with pytest.raises(SettingError, match=r"shape of x = \(3,\) is not allowed: expected \(9999999,\) or \(2,\)"):
@@ -383,7 +383,7 @@ def test_rbm_of_the_package(tmp_path):
     np.savez_compressed(tmp_path / "rbm.npz", **{name: t.numpy() for name, t in rbm.state_dict().items()})
     problem = read_problem(tmp_path / "rbm.npz").problem
     x = (rng.uniform((9, 7), generator=rng.stream(0, "states"), like=torch.zeros(())) < 0.5).float()
-    torch.testing.assert_close(problem.energy(x).float(), rbm.energy(x[:, :4], x[:, 4:]).detach())
+    torch.testing.assert_close(torch.as_tensor(problem.energy(x)).float(), rbm.energy(x[:, :4], x[:, 4:]).detach())
 
 
 # ------------------------------------------------------------------------------------------------ every format
@@ -399,7 +399,7 @@ def test_packed_files_have_the_name_and_energies_of_the_others(write, name, text
         packed = read_problem(write(f"{name}{suffix}", compress(text.encode())))
         assert packed.name == plain.name == name.rpartition(".")[0]
         assert packed.format == plain.format
-        assert packed.problem.energy(states(2)).equal(plain.problem.energy(states(2)))
+        assert np.array_equal(packed.problem.energy(states(2)), plain.problem.energy(states(2)))
         assert read_problem(write(name, compress(text.encode()))).format == plain.format, "told by its first bytes"
 
 

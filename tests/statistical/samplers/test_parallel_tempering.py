@@ -8,7 +8,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
 from memcomp_lightning.samplers import PCD, ParallelTempering, positive_phase
-from memcomp_lightning.samplers.tempering import betas
+from memcomp_lightning.samplers.parallel_tempering import betas
 from memcomp_lightning.testing import chi_square_p_value, state_counts
 from memcomp_lightning.testing.conformance import small_rbm
 

@@ -1,0 +1,82 @@
+"""What numpy arrays and torch tensors do not share, so that problems and solvers are written once for both.
+
+Most is the Python array API standard, see :func:`namespace`. Nothing here imports torch: people with a QUBO in a
+file do not wait for it.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from array_api_compat import array_namespace
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    Array = Tensor
+    """A numpy array or a tensor; what both have is checked as a tensor's."""
+    AnyArray = Tensor | NDArray[Any]
+    """The same where it comes from outside."""
+else:
+    Array = AnyArray = Any
+
+
+def as_array(x: AnyArray) -> Array:
+    """``x`` as it is; for type checkers."""
+    return x  # type: ignore[return-value]
+
+
+def namespace(x: Array) -> Any:
+    """The functions of the array API for arrays like ``x``: numpy's, or those of torch."""
+    return np if isinstance(x, np.ndarray | np.generic) else array_namespace(x)
+
+
+def alike(x: AnyArray, like: AnyArray) -> Array:
+    """``x`` as an array of the library and the device of ``like``, in its own dtype."""
+    if type(x) is type(like) and x.device == like.device:
+        return as_array(x)
+    if isinstance(like, np.ndarray | np.generic):
+        return as_array(to_numpy(x))
+    return namespace(like).asarray(x, device=like.device)
+
+
+def to_numpy(x: AnyArray) -> NDArray[Any]:
+    """``x`` as a numpy array, which shares its memory where it can."""
+    return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
+
+
+def cast(x: Array, dtype: Any) -> Array:
+    """``x`` in another dtype of its library; itself if it has that dtype."""
+    return x.astype(dtype, copy=False) if isinstance(x, np.ndarray | np.generic) else x.to(dtype)
+
+
+def double(x: Array) -> Array:
+    """``x`` in float64."""
+    return cast(x, namespace(x).float64)
+
+
+def multiply_add(x: Array, a: Array, b: Array) -> Array:
+    """``x + a b``, rounded once where the library can do so."""
+    return x + a * b if isinstance(x, np.ndarray) else x.addcmul(a, b)
+
+
+def sigmoid(x: Array) -> Array:
+    """``1 / (1 + exp(-x))``."""
+    return as_array(0.5 + 0.5 * np.tanh(x / 2)) if isinstance(x, np.ndarray) else x.sigmoid()
+
+
+def add_up(values: Array, index: Array, n: int) -> Array:
+    """The sum of the values of each place, ``(*leading, n)``.
+
+    Args:
+        values: ``(*leading, n_values)``.
+        index: The place of each value, ``(n_values,)`` integers in [0, n).
+        n: Number of places.
+    """
+    total: Array = namespace(values).zeros((*values.shape[:-1], n), dtype=values.dtype, device=values.device)
+    if not isinstance(values, np.ndarray):
+        return total.index_add_(-1, index, values)
+    row = n * np.arange(math.prod(values.shape[:-1]))
+    np.add.at(total.reshape(-1), (row[:, None] + index).reshape(-1), values.reshape(-1))
+    return total
