@@ -44,6 +44,11 @@ def require_choice(name: str, value: object, allowed: Collection[str]) -> None:
     require(value in allowed, name, value, "one of " + ", ".join(repr(option) for option in allowed))
 
 
+def require_some(name: str, values: Collection[object] | None, allowed: str) -> None:
+    """Raise if ``values`` are given, but none of them."""
+    require(values is None or len(values) > 0, name, values, allowed)
+
+
 def require_parts(name: str, value: object, kind: str, parts: Collection[str]) -> None:
     """Raise unless ``value`` has the methods and attributes that a protocol asks for.
 

@@ -4,7 +4,7 @@ import lightning.pytorch as pl
 
 from memcomp_lightning.callbacks.base import iteration_of
 from memcomp_lightning.training import Schedule
-from memcomp_lightning.training.schedules import begin_pass
+from memcomp_lightning.training.schedules import begin_pass, check_schedules
 
 
 class Schedules(pl.Callback):
@@ -26,9 +26,7 @@ class Schedules(pl.Callback):
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Check the optimisers."""
-        for schedule in self.schedules:
-            for optimizer in trainer.optimizers:
-                schedule.check(optimizer)
+        check_schedules(self.schedules, trainer.optimizers)
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Set what this pass needs."""

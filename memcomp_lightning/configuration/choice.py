@@ -74,7 +74,15 @@ def trial_of(
     if value is not None:
         own = for_trial(config, value) if choosing else with_choice(config, value)
     settings: Any = OmegaConf.to_container(own, resolve=False)
-    return AccuracyTrial(method, settings, plan_of, own.pretrain.iterations, own.seed, value, choosing)
+    return AccuracyTrial(
+        method=method,
+        settings=settings,
+        build=plan_of,
+        iterations=own.pretrain.iterations,
+        seed=own.seed,
+        value=value,
+        choosing=choosing,
+    )
 
 
 def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str, Any] | None]:

@@ -1,10 +1,9 @@
 """``experiment=sampler_worth``: energy models trained by many samplers, measured by likelihood on the way."""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -12,11 +11,11 @@ from memcomp_lightning.configuration.composition import check_not_given, compose
 from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import UserError, require, require_choice
-from memcomp_lightning.files import write_text
+from memcomp_lightning.files import write_json
 from memcomp_lightning.models import joint_model, stacked
 from memcomp_lightning.studies import LikelihoodTrial, Records, runner
-from memcomp_lightning.studies.likelihood import pretraining_of
 from memcomp_lightning.studies.measures import MEASURES
+from memcomp_lightning.studies.plan import pretraining_of
 from memcomp_lightning.studies.worth import Comparison, Method
 
 _SET_BY_COMPARISON = {
@@ -37,7 +36,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
             "worth.replicas=N or worth.methods.NAME.rates=[...]."
         )
     check_not_given(overrides, _SET_BY_COMPARISON, "a comparison")
-    comparison = _comparison(config)
+    comparison = filled(Comparison, config.worth, "worth")
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
     seen: set[tuple[str, str]] = set()
     for trial in _trials(comparison, overrides, Path()):
@@ -56,17 +55,13 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
 
 def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     """Train what is missing; each record is written when it exists."""
-    comparison, records = _comparison(config), Records(folder)
-    write_text(folder / "worth.json", json.dumps(asdict(comparison), indent=1) + "\n")
+    comparison, records = filled(Comparison, config.worth, "worth"), Records(folder)
+    write_json(folder / "worth.json", asdict(comparison))
     (folder / "weights").mkdir(exist_ok=True)
     done = records.keys
     missing = [trial for trial in _trials(comparison, overrides, folder) if trial.key not in done]
     with runner(comparison.name, workers=comparison.workers) as run:
         run(missing, records)
-
-
-def _comparison(config: DictConfig) -> Comparison:
-    return filled(Comparison, config.worth, "worth")
 
 
 def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> Iterator[LikelihoodTrial]:
@@ -76,8 +71,9 @@ def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> I
             method = comparison.methods[method_name]
             passes = max(1, round(data_set.passes * method.longer))
             own_overrides = (*method.overrides, *data_set.overrides)
-            schedule = _schedule(composed_for(overrides, (*own_overrides, *_run_settings(passes))), passes, method)
-            composed = composed_for(overrides, (*own_overrides, *_run_settings(schedule.iterations)))
+            usual = composed_for(overrides, (*own_overrides, *_run_settings(passes)))
+            iterations, greedy_passes, all_passes = _schedule(usual, passes, method)
+            composed = composed_for(overrides, (*own_overrides, *_run_settings(iterations)))
             for rate in data_set.rates or method.rates or comparison.rates:
                 own: Any = OmegaConf.to_container(composed, resolve=False)
                 own["pretrain"] = {**own["pretrain"], "optimizer": {**own["pretrain"]["optimizer"], "lr": rate}}
@@ -90,36 +86,26 @@ def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> I
                     build=plan_of,
                     n_reported=comparison.n_reported(data_name),
                     n_choosing=data_set.choosing or comparison.choosing,
-                    points=_points(schedule.passes, data_set.points or comparison.points),
+                    points=_points(all_passes, data_set.points or comparison.points),
                     measure=data_set.measure,
                     gradient_draws=comparison.gradient_draws,
-                    greedy_passes=schedule.greedy_passes,
+                    greedy_passes=greedy_passes,
                 )
 
 
-class _Schedule(NamedTuple):
-    """Passes of one method.
+def _schedule(composed: DictConfig, passes: int, method: Method) -> tuple[int, int, int]:
+    """Share passes out to layers, so that methods of many layers and of one have about as many updates.
 
-    Attributes:
-        iterations: Of a layer, or of all layers together.
-        greedy_passes: Of each layer, before joint training.
-        passes: All together.
+    Returns:
+        Passes of a layer or of all layers together, of each layer before joint training, and all of them.
     """
-
-    iterations: int
-    greedy_passes: int
-    passes: int
-
-
-def _schedule(composed: DictConfig, passes: int, method: Method) -> _Schedule:
-    """Share passes out to layers, so that methods of many layers and of one have about as many updates."""
     n_phases, layers = len(pretraining_of(build(composed))[1].phases), len(composed.model.get("hidden_sizes", [0]))
     if n_phases > 1 or not method.greedy_start:
         each = max(1, passes // n_phases)
-        return _Schedule(each, 0, each * n_phases)
+        return each, 0, each * n_phases
     greedy = round(passes * method.greedy_start / layers)
     joint = max(1, passes - greedy * layers)
-    return _Schedule(joint, greedy, greedy * layers + joint)
+    return joint, greedy, greedy * layers + joint
 
 
 def _run_settings(passes: int) -> tuple[str, ...]:

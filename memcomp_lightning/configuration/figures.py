@@ -1,11 +1,9 @@
 """A figure of the paper: its curves as trials, a record for each as soon as it exists."""
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from hydra import compose
 from omegaconf import DictConfig
@@ -14,8 +12,8 @@ from memcomp_lightning.configuration.choice import for_trial, trial_of, tried_va
 from memcomp_lightning.configuration.composition import check_not_given, composed_for
 from memcomp_lightning.configuration.plans import build, check_without_trainer
 from memcomp_lightning.configuration.values import filled
-from memcomp_lightning.errors import require
-from memcomp_lightning.files import write_text
+from memcomp_lightning.errors import require, require_some
+from memcomp_lightning.files import write_json
 from memcomp_lightning.studies import AccuracyTrial, Claim, FigurePlan, Records, grouped, runner
 
 _SET_BY_FIGURE = {
@@ -30,13 +28,7 @@ _SET_BY_CURVES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """Networks that differ only in what the figure varies.
-
-    Attributes:
-        label: For people.
-        overrides: What is theirs, as on the command line.
-        iterations: Of pretraining, unless those of the figure.
-    """
+    """Networks that differ only in what the figure varies; ``iterations`` stand in the place of the figure's."""
 
     label: str
     overrides: list[str]
@@ -61,22 +53,19 @@ class Figure:
     choice: str | None = None
 
     def __post_init__(self) -> None:
+        numbers = "a list of numbers, at least one: [1, 5]"
         for name in ("passes", "iterations", "seeds"):
-            _require_some(f"figure.{name}", getattr(self, name))
+            require_some(f"figure.{name}", getattr(self, name), numbers)
         for name, curve in self.curves.items():
-            _require_some(f"figure.curves.{name}.iterations", curve.iterations)
-
-
-def _require_some(name: str, values: list[int] | None) -> None:
-    require(values is None or len(values) > 0, name, values, "a list of numbers, at least one: [1, 5]")
+            require_some(f"figure.curves.{name}.iterations", curve.iterations, numbers)
 
 
 def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     """Train what is missing for a figure; each record is written when it exists."""
     # Composed before anything trains: a file edited meanwhile changes nothing.
-    figure, composed = _figure(config), _curves(config, overrides)
+    figure, composed, plan = _read(config, overrides)
     records = Records(folder)
-    write_text(folder / "figure.json", json.dumps(asdict(_plan(config, overrides)), indent=1) + "\n")
+    write_json(folder / "figure.json", asdict(plan))
     with runner(figure.name, workers=figure.workers, accelerator=config.trainer.accelerator) as run:
         for choosing in (True, False):
             trials = [
@@ -94,8 +83,8 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         UserError, SettingError, InstantiationException: As ``build``.
     """
     check_not_given(overrides, {**_SET_BY_FIGURE, "sampler": _SET_BY_CURVES}, "a figure")
-    _plan(config, overrides)
-    for name, settings in _curves(config, overrides).items():
+    _, composed, _ = _read(config, overrides)
+    for name, settings in composed.items():
         values = tried_values(settings)
         if values:
             allowed = "a setting that the figure does not set itself, for each network of a curve"
@@ -114,25 +103,19 @@ def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictC
     return {name: (compose("config", some), some) for name, some in own.items()}
 
 
-def _figure(config: DictConfig) -> Figure:
-    return filled(Figure, config.figure, "figure")
-
-
-def _curves(config: DictConfig, overrides: Sequence[str]) -> dict[str, DictConfig]:
-    """Settings of each curve."""
-    return {name: composed_for(overrides, curve.overrides) for name, curve in _figure(config).curves.items()}
-
-
-def _plan(config: DictConfig, overrides: Sequence[str]) -> FigurePlan:
-    """What the report needs to know of the settings."""
-    figure, composed = _figure(config), _curves(config, overrides)
+def _read(config: DictConfig, overrides: Sequence[str]) -> tuple[Figure, dict[str, DictConfig], FigurePlan]:
+    """The settings of a figure, those of each curve, and what the report needs to know of them."""
+    figure = filled(Figure, config.figure, "figure")
+    composed = {name: composed_for(overrides, curve.overrides) for name, curve in figure.curves.items()}
     data = build(composed_for((*overrides, "pretrain.iterations=1", "finetune.iterations=1"))).stages[0].data
     claimed = [name for claim in figure.claims for name in claim.curves if name in figure.curves]
-    n_parts = math.prod(data.replicas)
-    parts = f"{n_parts} of {config.data.partitions} partitions of {data.n_train:,} images" if data.replicas else ""
-    seeds = f"{len(figure.seeds)} seeds" if len(figure.seeds) > 1 else ""
-    whole = f"all {data.n_train:,} training images" if not parts else ""
-    return FigurePlan(
+    scale = [f"all {data.n_train:,} training images"]
+    if data.replicas:
+        n_parts = math.prod(data.replicas)
+        scale = [f"{n_parts} of {config.data.partitions} partitions of {data.n_train:,} images"]
+    if len(figure.seeds) > 1:
+        scale.append(f"{len(figure.seeds)} seeds")
+    plan = FigurePlan(
         name=figure.name,
         title=figure.title,
         data=data.images.name,
@@ -142,8 +125,9 @@ def _plan(config: DictConfig, overrides: Sequence[str]) -> FigurePlan:
         labels={name: figure.curves[name].label for name in dict.fromkeys((*claimed, *figure.curves))},
         chosen={name: own.choose.setting for name, own in composed.items() if tried_values(own)},
         stop_early=[name for name, own in composed.items() if own.finetune.keep_best],
-        scale=", ".join(part for part in (whole, parts, seeds) if part),
+        scale=", ".join(scale),
     )
+    return figure, composed, plan
 
 
 def _trials(
@@ -151,11 +135,11 @@ def _trials(
 ) -> Iterator[AccuracyTrial]:
     """The networks of a curve, or those for its choice, that have no record."""
     iterations, seeds = figure.curves[name].iterations or figure.iterations, figure.seeds
-    tried: Sequence[Any] = tried_values(composed)
+    values: Sequence[float | None] = tried_values(composed)
     if choosing:
-        values, iterations, seeds = tried, iterations[-1:], seeds[:1]
+        iterations, seeds = iterations[-1:], seeds[:1]
     else:
-        values = [records.best_value(name)] if tried else [None]
+        values = [records.best_value(name)]  # None where nothing is chosen
     done = records.keys
     for value in values:
         first = trial_of(composed, name, value=value, choosing=choosing)

@@ -4,8 +4,8 @@ import copy
 import inspect
 import math
 import re
-from collections.abc import Hashable, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Hashable, Mapping
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +31,12 @@ from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import OptimizerFactory, Schedule
+from memcomp_lightning.training.schedules import check_schedules
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _GROUPS = (
-    "data",
-    "model",
-    "solver",
-    "sampler",
-    "positive",
-    "pretrain",
-    "finetune",
-    "trainer",
-    "logger",
-    "callbacks",
+    *("data", "model", "solver", "sampler", "positive"),
+    *("pretrain", "finetune", "trainer", "logger", "callbacks"),
 )
 _SETTINGS = {
     "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
@@ -122,27 +115,23 @@ def build(config: DictConfig) -> Plan:
             )
             callbacks.append(BestWeights())
         schedules = _schedules(config, "finetune")
-        settings: dict[str, Any] = {
-            "iterations": config.finetune.iterations,
-            "optimizer": _optimizer(config, "finetune", schedules),
-            "schedules": schedules,
-            "loss": config.finetune.loss,
-            "seed": seed,
-        }
-        classifier: Classifier
+        make: Callable[..., Classifier] = partial(Classifier, network)
         if isinstance(network, DBN):
-            generator = rng.stream(seed, "output weights")
-            output_init = instantiate(config.model.get("output_init"))
-            classifier = DBNClassifier(
+            make = partial(
+                DBNClassifier,
                 network,
                 n_classes=images.n_classes,
                 units=config.finetune.units,
-                output_init=output_init,
-                generator=generator,
-                **settings,
+                output_init=instantiate(config.model.get("output_init")),
+                generator=rng.stream(seed, "output weights"),
             )
-        else:
-            classifier = Classifier(network, **settings)
+        classifier = make(
+            iterations=config.finetune.iterations,
+            optimizer=_optimizer(config, "finetune", schedules),
+            schedules=schedules,
+            loss=config.finetune.loss,
+            seed=seed,
+        )
         finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
@@ -254,8 +243,7 @@ def _optimizer(config: DictConfig, stage: str, schedules: list[Schedule]) -> Opt
     factory: OptimizerFactory = instantiate(config[stage].optimizer)
     try:
         optimizer = factory([nn.Parameter(torch.zeros(1))])
-        for schedule in schedules:
-            schedule.check(optimizer)
+        check_schedules(schedules, [optimizer])
     except (TypeError, ValueError) as error:
         unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
         remedy = f" Leave it out: '~{stage}.optimizer.{unknown[1]}'." if unknown else ""
@@ -264,7 +252,8 @@ def _optimizer(config: DictConfig, stage: str, schedules: list[Schedule]) -> Opt
 
 
 def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
-    callbacks = [instantiate(callback) for callback in given(config.callbacks[stage] or {})]
+    settings = (config.callbacks[stage] or {}).values()
+    callbacks = [instantiate(callback) for callback in settings if callback is not None]
     for callback in callbacks:
         kind = type(callback).__name__
         require(isinstance(callback, pl.Callback), f"callbacks.{stage}", kind, "callbacks of Lightning")
@@ -280,11 +269,6 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
         # A trainer has one bar: the one that somebody chose takes the place of ours.
         callbacks = [callback for callback in callbacks if type(callback) is not StageProgressBar]
     return callbacks
-
-
-def given(callbacks: Mapping[Any, Any]) -> list[Any]:
-    """Settings of the callbacks of a stage, without those that are left out."""
-    return [callback for callback in callbacks.values() if callback is not None]
 
 
 _DTYPES = {

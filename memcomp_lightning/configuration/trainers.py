@@ -104,6 +104,19 @@ def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: lis
         SettingError, MisconfigurationException: A setting is not for the user to set, or out of range.
     """
     path = folder.checkpoint(stage.module.stage)
+    settings = _settings(config.trainer)
+    bars = [type(callback).__name__ for callback in stage.callbacks if isinstance(callback, ProgressBar)]
+    require(
+        not bars or settings.get("enable_progress_bar") in (None, True),
+        "trainer.enable_progress_bar",
+        settings.get("enable_progress_bar"),
+        f"true where there is a {'/'.join(bars)} among the callbacks",
+        "Leave it out: callbacks.pretrain.progress=null callbacks.finetune.progress=null.",
+    )
+    if settings.get("profiler") in ("simple", "advanced"):
+        # Lightning's own report of these goes to a log that is not shown.
+        kind = f"lightning.pytorch.profilers.{settings['profiler'].capitalize()}Profiler"
+        settings["profiler"] = {"_target_": kind, "dirpath": str(path.parent), "filename": "profile"}
     keep_last = ModelCheckpoint(
         dirpath=path.parent,
         filename=path.stem,
@@ -111,19 +124,23 @@ def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: lis
         save_on_train_epoch_end=True,
         enable_version_counter=False,
     )
-    return _make(
-        config,
+    make = instantiate(settings, _partial_=True, _convert_="all")
+    trainer: pl.Trainer = make(
         max_epochs=stage.module.n_epochs,
         callbacks=[*stage.callbacks, keep_last],
-        loggers=loggers,
-        folder=path.parent,
+        logger=loggers or False,
+        use_distributed_sampler=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        default_root_dir=path.parent,
+        plugins=[AtomicCheckpointIO()],
     )
+    return trainer
 
 
-def _make(
-    config: DictConfig, *, max_epochs: int, callbacks: list[pl.Callback], loggers: list[Logger], folder: Path
-) -> pl.Trainer:
-    resolved: Any = OmegaConf.to_container(config.trainer, resolve=True)
+def _settings(config: DictConfig) -> dict[str, Any]:
+    """The settings of the trainer, those that are the user's to set."""
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
     settings = {str(name): value for name, value in resolved.items()}
     of_trainer = [*inspect.signature(pl.Trainer).parameters, "_target_"]
     known = of_trainer if settings.get("_target_") == "lightning.pytorch.Trainer" else list(settings)
@@ -136,37 +153,12 @@ def _make(
             )
         harmless, allowed, remedy = _NOT_HERE.get(name, ((value,), "", ""))
         require(any(_same(value, one) for one in harmless), f"trainer.{name}", value, allowed, remedy)
-    passes = settings.get("check_val_every_n_epoch")
-    if passes is not None:
-        require_count("trainer.check_val_every_n_epoch", passes)
-    if settings.get("min_epochs") is not None:
-        require_count("trainer.min_epochs", settings["min_epochs"], minimum=0)
-    bars = [type(callback).__name__ for callback in callbacks if isinstance(callback, ProgressBar)]
-    require(
-        not bars or settings.get("enable_progress_bar") in (None, True),
-        "trainer.enable_progress_bar",
-        settings.get("enable_progress_bar"),
-        f"true where there is a {'/'.join(bars)} among the callbacks",
-        "Leave it out: callbacks.pretrain.progress=null callbacks.finetune.progress=null.",
-    )
-    if settings.get("profiler") in ("simple", "advanced"):
-        # Lightning's own report of these goes to a log that is not shown.
-        kind = f"lightning.pytorch.profilers.{settings['profiler'].capitalize()}Profiler"
-        settings["profiler"] = {"_target_": kind, "dirpath": str(folder), "filename": "profile"}
-    make = instantiate(settings, _partial_=True, _convert_="all")
-    trainer: pl.Trainer = make(
-        max_epochs=max_epochs,
-        callbacks=callbacks,
-        logger=loggers or False,
-        use_distributed_sampler=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        default_root_dir=folder,
-        plugins=[AtomicCheckpointIO()],
-    )
-    return trainer
+    for name, minimum in (("check_val_every_n_epoch", 1), ("min_epochs", 0)):
+        if settings.get(name) is not None:
+            require_count(f"trainer.{name}", settings[name], minimum)
+    return settings
 
 
-def _same(value: Any, harmless: Any) -> bool:
+def _same(value: object, harmless: object) -> bool:
     """Whether two values of a setting are the same one; 1 batch is not 1.0, all of them."""
     return value == harmless and (type(value) is type(harmless) or value == 0)

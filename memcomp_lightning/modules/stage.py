@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from memcomp_lightning import rng
 from memcomp_lightning.modules.trainers import check_trainer, tries
 from memcomp_lightning.training import DivergedError, OptimizerFactory, Schedule, diverged_parameter
-from memcomp_lightning.training.schedules import begin_pass
+from memcomp_lightning.training.schedules import begin_pass, check_schedules
 
 
 class NotTrainedError(ValueError):
@@ -217,9 +217,7 @@ class StageModule(pl.LightningModule):
             ValueError: The checkpoint was written by another number of processes.
         """
         self._started_at = time.perf_counter()
-        for schedule in self.schedules:
-            for optimizer in self.trainer.optimizers:
-                schedule.check(optimizer)
+        check_schedules(self.schedules, self.trainer.optimizers)
         if self._loaded is None:
             return
         states, self._loaded = self._loaded, None

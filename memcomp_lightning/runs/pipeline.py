@@ -8,7 +8,6 @@ import lightning.pytorch as pl
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
-from torch import Tensor
 
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
@@ -56,37 +55,35 @@ def run(
     """
     done = folder.finished_stages
     records: dict[str, Any] = {}
-    is_global_zero, only_tries = True, False
+    keeps = True
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
-            if stage is plan.pretraining:
-                plan.change_between_stages(seed)
-            continue
-        with threads_for(stage):
-            trainer = _fit(stage, make_trainer(stage), folder)
-        is_global_zero, only_tries = trainer.is_global_zero, tries(trainer)
-        records[name] = _record(stage)
-        if is_global_zero and not only_tries:
-            save_weights(stage.module.network, folder.weights(name))
-            folder.finish_stage(name, records[name])
+        else:
+            with threads_for(stage):
+                trainer = _fit(stage, make_trainer(stage), folder)
+            keeps = trainer.is_global_zero and not tries(trainer)
+            records[name] = _record(stage)
+            if keeps:
+                save_weights(stage.module.network, folder.weights(name))
+                folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
             plan.change_between_stages(seed)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
     if choice is not None:
         result["choice"] = choice
     if plan.finetuning is not None:
-        module = plan.finetuning.module
+        module, data = plan.finetuning.module, plan.finetuning.data
         assert isinstance(module, Classifier)
-        score = evaluate(module.network, plan.finetuning.data.test_dataloader(), module.loss)
-        result["test_accuracy"] = _numbers(score.accuracy)
-        result["test_loss"] = _numbers(score.mean_loss)
-        if plan.finetuning.data.validation is not None:
-            held_out = evaluate(module.network, plan.finetuning.data.val_dataloader(), module.loss)
-            result["validation_accuracy"] = _numbers(held_out.accuracy)
-    if is_global_zero and not only_tries:
+        score = evaluate(module.network, data.test_dataloader(), module.loss)
+        result["test_accuracy"] = score.accuracy.flatten().tolist()
+        result["test_loss"] = score.mean_loss.flatten().tolist()
+        if data.validation is not None:
+            held_out = evaluate(module.network, data.val_dataloader(), module.loss)
+            result["validation_accuracy"] = held_out.accuracy.flatten().tolist()
+    if keeps:
         result["context"] = _context(plan, result)
         _log_final(loggers, settings, result)
         folder.finish(result)
@@ -164,8 +161,3 @@ def _log_final(loggers: Sequence[Logger], settings: Mapping[str, Any], result: d
     write_hyper_parameters(list(loggers), dict(settings), metrics)
     for logger in loggers:
         logger.finalize("success")
-
-
-def _numbers(values: Tensor) -> list[float]:
-    """One number a replica."""
-    return [float(value) for value in values.flatten()]

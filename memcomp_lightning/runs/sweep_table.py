@@ -1,12 +1,10 @@
 """The results of many runs as one table."""
 
-import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from memcomp_lightning.files import write_text
+from memcomp_lightning.files import as_csv, write_text
 from memcomp_lightning.runs.table import (
     LIKELIHOOD_TITLE,
     aligned,
@@ -45,9 +43,7 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
         pairs = [mean_and_error(values) if values else ("", "") for values in found.values()]
         sheet.append([*own, len(results), n_values, *(x for pair in pairs for x in pair), mean_s])
     shown = [column for column, title in enumerate(sheet[0]) if not _left_out(title, sheet, column)]
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows([row[column] for column in shown] for row in sheet)
-    write_text(path, buffer.getvalue())
+    write_text(path, as_csv([row[column] for column in shown] for row in sheet))
     return aligned(without_empty_columns(screen), most=terminal_width())
 
 

@@ -1,8 +1,7 @@
 """How many threads a stage computes with."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.studies.plan import Stage
@@ -11,8 +10,7 @@ WORTH_THREADS = 2**22
 """Products of a unit and a weight in an update from which a second thread helps: about a millisecond."""
 
 
-@contextmanager
-def threads_for(stage: Stage) -> Iterator[None]:
+def threads_for(stage: Stage) -> AbstractContextManager[None]:
     """Compute small updates in one thread, as fast as in several.
 
     More threads would wait for work by spinning, which makes two runs side by side ten times slower. If
@@ -20,5 +18,4 @@ def threads_for(stage: Stage) -> Iterator[None]:
     """
     n_products = stage.data.n_at_once * max(parameter.numel() for parameter in stage.module.parameters())
     alone = "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS
-    with in_one_thread() if alone else nullcontext():
-        yield
+    return in_one_thread() if alone else nullcontext()

@@ -3,9 +3,9 @@
 import json
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,9 +13,9 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import stacked
-from memcomp_lightning.modules import Classifier, EnergyPretraining
-from memcomp_lightning.studies.plan import Plan, Stage, passes_without_trainer
-from memcomp_lightning.studies.records import Key, Record
+from memcomp_lightning.modules import Classifier
+from memcomp_lightning.studies.plan import Plan, Stage, Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError, evaluate, finetune
 from memcomp_lightning.types import Batch
 
@@ -23,32 +23,11 @@ Progress = Callable[[str, int], None]
 """Takes what is being done, and how many network updates were done since the last call."""
 
 
-@dataclass(frozen=True)
-class AccuracyTrial:
-    """A network, with its replicas, that is pretrained, fine-tuned and tested.
+@dataclass(frozen=True, kw_only=True)
+class AccuracyTrial(Trial):
+    """A network, with its replicas, that is pretrained, fine-tuned and tested."""
 
-    Attributes:
-        method: Name of its curve.
-        settings: Of the run, as plain values.
-        build: Makes the objects of a run from its settings; a function of a module, which processes can import.
-        iterations: Of pretraining.
-        seed: Of weights, chains and order.
-        value: Of the setting that held-out images choose; None where nothing is chosen.
-        choosing: Whether the trial only serves the choice: held-out training images then judge it.
-    """
-
-    method: str
-    settings: dict[str, Any]
-    build: Callable[[dict[str, Any]], Plan]
-    iterations: int
     seed: int
-    value: float | None
-    choosing: bool
-
-    @property
-    def key(self) -> Key:
-        """Of the record that it leaves."""
-        return "", self.method, self.value, self.iterations, self.seed, self.choosing
 
     @property
     def fine_tuning(self) -> str:
@@ -61,17 +40,8 @@ class AccuracyTrial:
     def record(self, passes: Sequence[int], seconds: list[float], scores: dict[str, list[list[float]]]) -> Record:
         """What it leaves; held-out images judge by the mean over tested passes and replicas."""
         judged = float(np.mean(scores["validation_accuracy"])) if self.choosing else None
-        return Record(
-            method=self.method,
-            value=self.value,
-            iterations=self.iterations,
-            seed=self.seed,
-            choosing=self.choosing,
-            at=list(passes),
-            seconds=seconds,
-            measures=scores,
-            held_out=judged,
-        )
+        record = Record.of(self, at=list(passes), seconds=seconds, measures=scores)
+        return replace(record, held_out=judged)
 
 
 @dataclass(frozen=True)
@@ -105,8 +75,8 @@ class SideBySide:
         """
         device = device_of(self.trials[0].settings["trainer"]["accelerator"])
         trials, plans, pretrain_s, found = [], [], [], []
-        for number, trial in enumerate(self.trials):
-            progress(f"{self.title}, pretraining {number + 1} of {len(self.trials)}", 0)
+        for number, trial in enumerate(self.trials, start=1):
+            progress(f"{self.title}, pretraining {number} of {len(self.trials)}", 0)
             begin = time.perf_counter()
             try:
                 plan = pretrained(plan_of(trial, self.passes[-1]), trial.seed, device)
@@ -127,29 +97,24 @@ class SideBySide:
             curves = ", ".join(dict.fromkeys(trial.method for trial in trials))
             raise DivergedError(f"figure.curves.{curves}: {error}") from error
         for number, trial in enumerate(trials):
-            own = {name: [of_pass[number] for of_pass in values] for name, values in scores.items()}
+            own = {name: values[:, number].tolist() for name, values in scores.items()}
             until = [pretrain_s[number] + each / len(trials) for each in seconds]
             found.append(trial.record(self.passes, until, own))
         return found
 
     def _fine_tuned(
         self, plans: Sequence[Plan], trials: Sequence[AccuracyTrial], progress: Progress, device: torch.device
-    ) -> tuple[list[float], dict[str, list[list[list[float]]]]]:
-        """Seconds by pass; scores by name, pass, trial and replica."""
+    ) -> tuple[list[float], dict[str, Tensor]]:
+        """Seconds by pass; scores by name, ``(n_passes, n_trials, n_replicas)``."""
         begin = time.perf_counter()
         stage = tuning(plans[0])
         n_trials, replicas = len(plans), stage.data.replicas
-        network, loss = (
-            stacked([_classifier(plan).network for plan in plans], replicas),
-            _classifier(plans[0]).loss,
-        )
-        network.to(device)
+        loss = _classifier(plans[0]).loss
+        network = stacked([_classifier(plan).network for plan in plans], replicas).to(device)
         batches = stage.data.train_batches(0, 1).repeated([trial.seed for trial in trials]).to(device)
         tests = {"test": stage.data.test, "validation": stage.data.validation}
         images = {name: _side_by_side(*held, n_trials, replicas, device) for name, held in tests.items() if held}
-        scores: dict[str, list[Tensor]] = {
-            f"{name}_{what}": [] for name in images for what in ("accuracy", "loss")
-        }
+        scores = defaultdict(list)
         seconds = []
         n_updates = len(batches) * n_trials * math.prod(replicas)
         # Where several passes are tested, the best of these is found by the report.
@@ -175,11 +140,13 @@ class SideBySide:
             # Found at the end, when all is tested: what diverged is at chance.
             if not trials[0].choosing:
                 raise
-        return seconds, {name: torch.stack(x).view(len(x), n_trials, -1).tolist() for name, x in scores.items()}
+        return seconds, {name: torch.stack(x).view(len(x), n_trials, -1) for name, x in scores.items()}
 
 
 _IN_CACHE = 40
 """Small networks that one CPU core trains fastest side by side: more of them no longer fit into its cache."""
+
+_ON_GPU = 10_000
 
 
 def grouped(
@@ -199,22 +166,18 @@ def grouped(
     for alike in groups.values():
         data = tuning(plan_of(alike[0], passes[-1])).data
         n_replicas = math.prod(data.replicas)
+        on_cpu = device_of(alike[0].settings["trainer"]["accelerator"]).type == "cpu"
+        at_once = networks if networks is not None else _IN_CACHE if on_cpu else _ON_GPU
+        require_count("figure.networks", at_once)
         each = len(data.train_batches(0, 1)) * n_replicas * passes[-1]
-        size = _n_trials(alike[0], len(alike), n_replicas, networks)
+        most = max(1, at_once // n_replicas)
+        # Programs of about one size: replicas are what counts.
+        size = math.ceil(len(alike) / math.ceil(len(alike) / most))
         for start in range(0, len(alike), size):
             some = tuple(alike[start : start + size])
             programs.append(SideBySide(some, passes, each * len(some)))
     # So that no process is left alone with a long one at the end.
     return sorted(programs, key=lambda program: -program.n_updates)
-
-
-def _n_trials(trial: AccuracyTrial, n_all: int, n_replicas: int, networks: int | None) -> int:
-    """How many trials train as one program: replicas are what counts, in programs of about one size."""
-    if networks is None:
-        networks = 10_000 if device_of(trial.settings["trainer"]["accelerator"]).type != "cpu" else _IN_CACHE
-    require_count("figure.networks", networks)
-    most = max(1, int(networks // n_replicas))
-    return math.ceil(n_all / math.ceil(n_all / most))
 
 
 def plan_of(trial: AccuracyTrial, n_passes: int) -> Plan:
@@ -230,10 +193,8 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
     """Train the DBN of a plan, and change it as the control says."""
     plan.network.to(device)
     if plan.pretraining is not None:
-        stage = plan.pretraining
-        module, batches = stage.module, stage.data.train_batches(0, 1).to(device)
-        assert isinstance(module, EnergyPretraining)
-        for _ in passes_without_trainer(module, batches, seed=seed):
+        stage, module = pretraining_of(plan)
+        for _ in passes_without_trainer(module, stage.data.train_batches(0, 1).to(device), seed=seed):
             pass
     plan.change_between_stages(seed)
     return plan

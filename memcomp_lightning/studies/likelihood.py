@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,22 +22,18 @@ from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
-from memcomp_lightning.studies.plan import Plan, Stage, passes_without_trainer
-from memcomp_lightning.studies.records import Key, Record
+from memcomp_lightning.studies.plan import Plan, Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass
 
 
-@dataclass(frozen=True)
-class LikelihoodTrial:
+@dataclass(frozen=True, kw_only=True)
+class LikelihoodTrial(Trial):
     """All replicas of one method at one learning rate on one data set.
 
     Attributes:
-        data_set: Name of the data set.
-        method: Name of the method.
         value: Learning rate of the first update; held-out data choose one.
         folder: Of the run: final weights go there.
-        settings: Of a single run, as plain values.
-        build: Makes the objects of a run from its settings; a function of a module, which processes can import.
         n_reported: Seeds 0 to n - 1, side by side.
         n_choosing: Further seeds that choose the learning rate; likelihoods score them by held-out images.
         points: Passes after which the RBMs are measured.
@@ -46,12 +42,8 @@ class LikelihoodTrial:
         greedy_passes: Passes for each layer that come before joint training.
     """
 
-    data_set: str
-    method: str
     value: float
     folder: str
-    settings: dict[str, Any]
-    build: Callable[[dict[str, Any]], Plan]
     n_reported: int
     n_choosing: int
     points: tuple[int, ...]
@@ -74,21 +66,13 @@ class LikelihoodTrial:
         """For people."""
         return f"{self.data_set}, {self.method}, lr = {self.value:g}"
 
-    @property
-    def key(self) -> Key:
-        """Of the record that it leaves."""
-        return self.data_set, self.method, self.value, None, None, False
-
+    @in_one_thread()
     def run(self, progress: Progress) -> list[Record]:
         """Train the replicas side by side and measure them; measurements do not count as time.
 
         It runs on one thread and counts seconds of the processor, so that methods can be compared by time while
         other trials run beside.
         """
-        with in_one_thread():
-            return self._run(progress)
-
-    def _run(self, progress: Progress) -> list[Record]:
         plans = [self.build({**self.settings, "seed": seed}) for seed in range(self.n_replicas)]
         stage, module = pretraining_of(plans[0])
         network = stacked([plan.network for plan in plans], ())
@@ -97,25 +81,19 @@ class LikelihoodTrial:
         measure, seconds = MEASURES[self.measure], 0.0
         score = measure.make(stage.data, self.n_reported)
         begin, reported = time.process_time(), 0
-        training = _training(self, plans[0], network, batches)
+        passes, present_model = _training(self, plans[0], network, batches)
         names = ["score", "reverse"][: 1 + measure.both_ways]
-        record = Record(
-            data_set=self.data_set,
-            method=self.method,
-            value=self.value,
-            at=[],
-            seconds=[],
-            measures={name: [] for name in (*names, "cosine", "relative_error")},
-        )
+        measures: dict[str, list[list[float]]] = {name: [] for name in (*names, "cosine", "relative_error")}
+        record = Record.of(self, at=[], seconds=[], measures=measures)
         updates_a_pass = sum(batch.closes_step for batch in batches)
         try:
-            for done in training.passes:
+            for done in passes:
                 if done.number not in self.points:
                     continue
                 seconds += time.process_time() - begin
                 progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
                 reported = done.number
-                model, diverged = without_diverged(training.model())
+                model, diverged = without_diverged(present_model())
                 scores = [x.double().masked_fill(diverged, math.inf) for x in score(model) if x is not None]
                 bias = gradient_bias(model, module.sampler, done, self.gradient_draws)
                 _add(record, done.number * updates_a_pass, seconds, [x.tolist() for x in (*scores, *bias)])
@@ -128,28 +106,8 @@ class LikelihoodTrial:
                     _add(record, updates, seconds, [*(worst for _ in names), nothing, nothing])
         record = replace(record, held_out=-float(np.median(record.measured("score")[-1, self.n_reported :])))
         with written_whole(weights_path(Path(self.folder), record)) as path:
-            torch.save(training.model().state_dict(), path)
+            torch.save(present_model().state_dict(), path)
         return [record]
-
-
-class Training(NamedTuple):
-    """A training under way.
-
-    Attributes:
-        passes: Trains; what is done, pass by pass.
-        model: The energy model as it is now.
-    """
-
-    passes: Iterator[Pass]
-    model: Callable[[], Any]
-
-
-def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
-    """The pretraining of a plan."""
-    stage = plan.pretraining
-    assert stage is not None
-    assert isinstance(stage.module, EnergyPretraining)
-    return stage, stage.module
 
 
 def weights_path(folder: Path, record: Record) -> Path:
@@ -165,8 +123,10 @@ def _add(record: Record, updates: int, seconds: float, values: Sequence[list[flo
         kept.append(new)
 
 
-def _training(trial: LikelihoodTrial, plan: Plan, network: Any, batches: Batches) -> Training:
-    """Layer by layer, or all units at once."""
+def _training(
+    trial: LikelihoodTrial, plan: Plan, network: Any, batches: Batches
+) -> tuple[Iterator[Pass], Callable[[], Any]]:
+    """Passes, layer by layer or of all units at once, and what gives the model as it is after one of them."""
     module = pretraining_of(plan)[1]
     done = 0
     if trial.greedy_passes:
@@ -175,11 +135,11 @@ def _training(trial: LikelihoodTrial, plan: Plan, network: Any, batches: Batches
             done = before.number
     assert plan.stage_for is not None
     stage = plan.stage_for(network)
-    passes = passes_without_trainer(module, batches, stage=stage)
-    return Training(
-        (after._replace(number=done + after.number) for after in passes),
-        lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network),
+    passes = (
+        after._replace(number=done + after.number)
+        for after in passes_without_trainer(module, batches, stage=stage)
     )
+    return passes, lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network)
 
 
 def _warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:

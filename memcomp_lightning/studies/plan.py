@@ -11,6 +11,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import EnergyPretraining, StageModule
+from memcomp_lightning.studies.records import Named
 from memcomp_lightning.training import Batches, Pass, PretrainingStage, pretrain
 
 
@@ -39,12 +40,7 @@ def passes_without_trainer(
 ) -> Iterator[Pass]:
     """Train as a module would under a trainer; yield what is done, pass by pass.
 
-    Args:
-        module: The pretraining.
-        batches: Its images.
-        stage: Another network's, in the place of the module's.
-        iterations: Other than the module's.
-        seed: Of the random streams.
+    ``stage`` (of another network) and ``iterations`` stand in the place of the module's own.
     """
     return pretrain(
         stage or module.pretraining,
@@ -85,3 +81,24 @@ class Plan:
     def stages(self) -> list[Stage]:
         """The stages in order."""
         return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial(Named):
+    """A training that leaves a record.
+
+    Attributes:
+        settings: Of its run, as plain values.
+        build: Makes the objects of a run from its settings; a function of a module, which processes can import.
+    """
+
+    settings: dict[str, Any]
+    build: Callable[[dict[str, Any]], Plan]
+
+
+def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
+    """The first stage of a plan that pretrains, and its module."""
+    stage = plan.pretraining
+    assert stage is not None
+    assert isinstance(stage.module, EnergyPretraining)
+    return stage, stage.module

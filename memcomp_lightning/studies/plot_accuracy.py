@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from memcomp_lightning.studies.comparison import signed
-from memcomp_lightning.studies.results import Claim, Results
+from memcomp_lightning.studies.results import Claim, Point, Results
 from memcomp_lightning.studies.verdicts import gains_by_pretraining, horizontal_arrow, vertical_arrow
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
@@ -17,18 +17,24 @@ _MARKERS = ("s", "o", "^", "D", "v", "P", "X", "*")
 _LINES = ("--", ":", "-.", (0, (5, 1)), (0, (1, 1)), (0, (3, 1, 1, 1)))
 
 
-def plot_against_iterations(results: Results, *, width: float = 7.2, height: float = 3.1) -> Figure:
+def accuracy_figures(results: Results) -> dict[str, Figure]:
+    """All pictures of a figure, by the names of their files."""
+    name = results.plan.name
+    controls = {f"{name}_controls": plot_controls(results)}
+    if results.plan.against == "passes":
+        return {name: plot_against_passes(results), **controls}
+    if any(len(results.lengths(curve)) > 1 for curve in results.curves):
+        return {name: plot_against_iterations(results), **controls}
+    return controls
+
+
+def plot_against_iterations(results: Results) -> Figure:
     """A panel for each number of passes (Figs. 4 and 5): curves with sigma / sqrt(n), arrows with their lengths.
 
     Curves with several pretraining lengths are lines; networks without pretraining are level lines.
-
-    Args:
-        results: Of one figure.
-        width: Of a panel, inches.
-        height: Of a panel, inches.
     """
     passes = results.plan.passes
-    figure = Figure(figsize=(width, height * len(passes) + 0.5), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.1 * len(passes) + 0.5), layout="constrained")
     panels = figure.subplots(len(passes), 1, sharex=True, squeeze=False)[:, 0]
     lines = [curve for curve in results.curves if len(results.lengths(curve)) > 1]
     levels = [
@@ -36,7 +42,8 @@ def plot_against_iterations(results: Results, *, width: float = 7.2, height: flo
     ]
     for letter, axes, done in zip("abcdefgh", panels, passes, strict=False):
         for number, curve in enumerate(lines):
-            _errorbar(axes, results, curve, number, [(n, done) for n in results.lengths(curve)])
+            lengths = results.lengths(curve)
+            _errorbar(axes, results, curve, number, lengths, [results.point(curve, n, done) for n in lengths])
         for number, curve in enumerate(levels[: len(_LINES)]):
             mean = results.point(curve, 0, done).mean
             colour = _COLOURS[(len(lines) + number) % len(_COLOURS)]
@@ -52,26 +59,17 @@ def plot_against_iterations(results: Results, *, width: float = 7.2, height: flo
     return figure
 
 
-def plot_against_passes(results: Results, *, width: float = 6.8, height: float = 4.6) -> Figure:
-    """Accuracy against fine-tuning passes (Fig. 6), the end of training in the inset.
-
-    Args:
-        results: Of one figure.
-        width: Inches.
-        height: Inches.
-    """
-    figure = Figure(figsize=(width, height), layout="constrained")
+def plot_against_passes(results: Results) -> Figure:
+    """Accuracy against fine-tuning passes (Fig. 6), the end of training in the inset."""
+    figure = Figure(figsize=(6.8, 4.6), layout="constrained")
     axes = figure.subplots()
     passes = results.plan.passes
     inset = axes.inset_axes((0.42, 0.12, 0.55, 0.5))
     for panel, shown in ((axes, passes), (inset, [p for p in passes if p >= passes[-1] / 10])):
         for number, curve in enumerate(results.curves):
-            _errorbar(
-                panel, results, curve, number, [(results.lengths(curve)[-1], done) for done in shown], by_pass=True
-            )
+            _errorbar(panel, results, curve, number, shown, [results.last(curve, done) for done in shown])
         panel.grid(alpha=0.25)
-    ends = [results.point(curve, results.lengths(curve)[-1], passes[-1]).mean for curve in results.curves]
-    middle = float(np.median(ends))
+    middle = float(np.median([results.last(curve, passes[-1]).mean for curve in results.curves]))
     inset.set_ylim(middle - 0.025, middle + 0.02)
     inset.tick_params(labelsize=7)
     axes.set(xscale="log", xlabel="back-propagation passes", ylabel="test accuracy")
@@ -79,21 +77,16 @@ def plot_against_passes(results: Results, *, width: float = 6.8, height: float =
     return figure
 
 
-def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
-    """Every curve at its last N after each number of passes: mean and standard error, a row each.
-
-    Args:
-        results: Of one figure.
-        width: Inches.
-    """
+def plot_controls(results: Results) -> Figure:
+    """Every curve at its last N after each number of passes: mean and standard error, a row each."""
     passes = results.plan.passes if len(results.plan.passes) <= 4 else results.plan.passes[-1:]
     curves, claimed = results.curves, results.plan.claimed
-    figure = Figure(figsize=(width, 0.26 * len(curves) + 1.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 0.26 * len(curves) + 1.2), layout="constrained")
     panels = figure.subplots(1, len(passes), sharey=True, squeeze=False)[0]
     rows = np.arange(len(curves))[::-1]
     for axes, done in zip(panels, passes, strict=True):
         for row, curve in zip(rows, curves, strict=True):
-            point = results.point(curve, results.lengths(curve)[-1], done)
+            point = results.last(curve, done)
             colour = _COLOURS[claimed.index(curve) % len(_COLOURS)] if curve in claimed else "0.35"
             error = None if math.isnan(point.error) else 2 * point.error
             axes.errorbar(point.mean, row, xerr=error, fmt="o", ms=4, color=colour, capsize=2)
@@ -117,16 +110,13 @@ def _errorbar(
     results: Results,
     curve: str,
     number: int,
-    points: Sequence[tuple[int, int]],
-    *,
-    by_pass: bool = False,
+    x: Sequence[int],
+    points: Sequence[Point],
 ) -> None:
-    found = [results.point(curve, n, done) for n, done in points]
-    errors = [0.0 if math.isnan(point.error) else point.error for point in found]
     axes.errorbar(
-        [done if by_pass else n for n, done in points],
-        [point.mean for point in found],
-        errors,
+        x,
+        [point.mean for point in points],
+        [0.0 if math.isnan(point.error) else point.error for point in points],
         color=_COLOURS[number % len(_COLOURS)],
         marker=_MARKERS[number % len(_MARKERS)],
         ms=3.5,
@@ -140,7 +130,7 @@ def _errorbar(
 def _arrows(axes: Axes, results: Results, claim: Claim, passes: int, *, column: int) -> None:
     """The paper's two arrows: iterations saved, and accuracy gained at the last N."""
     last = results.lengths(claim.better)[-1]
-    low, high = (results.point(curve, results.lengths(curve)[-1], passes).mean for curve in claim.curves)
+    low, high = (results.last(curve, passes).mean for curve in claim.curves)
     x = last + 1.2 + 6 * column
     style = {"arrowstyle": "<->", "color": "black", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", xy=(x, high), xytext=(x, low), arrowprops=style, annotation_clip=False)
@@ -151,7 +141,7 @@ def _arrows(axes: Axes, results: Results, claim: Claim, passes: int, *, column: 
         axes.annotate("", xy=(saved[0], low), xytext=(saved[1], low), arrowprops={**style, "arrowstyle": "->"})
         axes.annotate(
             f"{saved[1] - saved[0]} iterations",
-            xy=((saved[0] + saved[1]) / 2, low),
+            xy=(sum(saved) / 2, low),
             xytext=(0, -11),
             textcoords="offset points",
             ha="center",

@@ -1,8 +1,8 @@
 """What was measured in a study: one line of JSON for each trial and its replicas."""
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,8 @@ Key = tuple[str, str, float | None, int | None, int | None, bool]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record:
-    """What one trial left.
+class Named:
+    """What tells trials from each other, and their records.
 
     Attributes:
         method: What was trained: a curve of a figure, a method of a comparison.
@@ -24,11 +24,7 @@ class Record:
         value: Of the setting that held-out data choose; None if nothing is chosen.
         iterations: Pretraining iterations N of each layer; None where the method says how many.
         seed: Of weights, chains and order; None where each replica has its own.
-        choosing: Whether the trial was done for the choice alone.
-        at: Passes of fine-tuning, or updates, after which it was measured.
-        seconds: Of training until each measurement.
-        measures: By name, a number for each measurement and replica.
-        held_out: What held-out data say of the trial, more is better; None where they do not judge it.
+        choosing: Whether the trial only serves the choice: held-out data then judge it.
     """
 
     method: str
@@ -37,15 +33,36 @@ class Record:
     iterations: int | None = None
     seed: int | None = None
     choosing: bool = False
+
+    @property
+    def key(self) -> Key:
+        """All of it."""
+        return self.data_set, self.method, self.value, self.iterations, self.seed, self.choosing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record(Named):
+    """What one trial left.
+
+    Attributes:
+        at: Passes of fine-tuning, or updates, after which it was measured.
+        seconds: Of training until each measurement.
+        measures: By name, a number for each measurement and replica.
+        held_out: What held-out data say of the trial, more is better; None where they do not judge it.
+    """
+
     at: list[int]
     seconds: list[float]
     measures: dict[str, list[list[float]]]
     held_out: float | None = None
 
-    @property
-    def key(self) -> Key:
-        """What tells it from the other records."""
-        return self.data_set, self.method, self.value, self.iterations, self.seed, self.choosing
+    @classmethod
+    def of(
+        cls, trial: Named, *, at: list[int], seconds: list[float], measures: dict[str, list[list[float]]]
+    ) -> "Record":
+        """What a trial leaves, not judged yet."""
+        names = {field.name: getattr(trial, field.name) for field in fields(Named)}
+        return cls(**names, at=at, seconds=seconds, measures=measures)
 
     def measured(self, name: str) -> NDArray[np.float64]:
         """A measure, ``(n_measurements, n_replicas)``."""
@@ -80,12 +97,11 @@ class Records:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
                 write_text(self.path, "".join(_line(record) for record in self.all))
 
-    def append(self, records: Iterable[Record]) -> None:
+    def append(self, records: Sequence[Record]) -> None:
         """Add records to the list and to the file."""
-        new = list(records)
         with self.path.open("a", encoding="utf-8") as file:
-            file.write("".join(_line(record) for record in new))
-        self.all += new
+            file.write("".join(_line(record) for record in records))
+        self.all += records
 
     @property
     def keys(self) -> set[Key]:

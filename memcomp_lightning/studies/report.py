@@ -2,23 +2,21 @@
 
 import io
 import json
+import shlex
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
-from memcomp_lightning.files import write_text, written_whole
-from memcomp_lightning.studies.event_files import event_file
+from memcomp_lightning.errors import UserError
+from memcomp_lightning.files import as_csv, write_text, written_whole
+from memcomp_lightning.studies.event_files import write_event_file
 from memcomp_lightning.studies.page import Section, markdown
-from memcomp_lightning.studies.plot_accuracy import plot_against_iterations, plot_against_passes, plot_controls
+from memcomp_lightning.studies.plot_accuracy import accuracy_figures
+from memcomp_lightning.studies.plot_worth import plot_worth
 from memcomp_lightning.studies.results import read_results
-from memcomp_lightning.studies.verdicts import verdicts
-from memcomp_lightning.studies.worth import WORTH_RULE, read_worth
-from memcomp_lightning.studies.worth_report import write_worth
-
-
-class NothingMeasuredError(ValueError):
-    """A study has not left a record yet."""
+from memcomp_lightning.studies.verdicts import RULE, verdicts
+from memcomp_lightning.studies.worth import WORTH_RULE, read_worth, worth_table, worth_verdicts
+from memcomp_lightning.studies.worth_report import write_events
 
 
 def write_report(folder: Path) -> Section:
@@ -26,40 +24,41 @@ def write_report(folder: Path) -> Section:
 
     Raises:
         FileNotFoundError: The folder holds no study.
-        NothingMeasuredError: Nothing was measured yet.
+        UserError: Nothing was measured yet.
     """
     picture = folder / "figure2.png"
     if picture.exists():
         notes = json.loads((folder / "figure2.json").read_text(encoding="utf-8"))
         return Section(notes["title"], [("Fig. 2", picture.read_bytes())], [], notes["notes"])
+    notes, origin = [], folder / "origin.json"
+    if origin.exists():
+        made_by = json.loads(origin.read_text(encoding="utf-8"))
+        notes.append(", ".join(f"{key} {value}" for key, value in made_by.items()))
     if (folder / "worth.json").exists():
-        return _report_worth(folder)
-    results = read_results(folder)
-    if not results.curves:
-        raise NothingMeasuredError(f"{folder} has no records yet")
-    name = results.plan.name
-    write_text(folder / f"{name}.csv", results.table())
-    judged = verdicts(results)
+        worth = read_worth(folder)
+        _check_measured(folder, bool(worth.data_sets))
+        name, title, rule = "sampler_worth", worth.plan.title, WORTH_RULE
+        figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
+        numbers, judged = as_csv(worth_table(worth)), worth_verdicts(worth)
+        write_events(worth, folder / "tensorboard")
+    else:
+        results = read_results(folder)
+        _check_measured(folder, bool(results.curves))
+        plan, rule = results.plan, RULE
+        name, title = plan.name, f"{plan.name}: {plan.data}, {plan.title}"
+        figures = accuracy_figures(results)
+        numbers, judged = results.table(), verdicts(results)
+        notes.append(f"Training took {results.seconds / 60:.1f} min of one core.")
+    write_text(folder / f"{name}.csv", numbers)
     write_text(folder / "verdicts.md", markdown(judged))
-    figures = {f"{name}_controls": plot_controls(results)}
-    if results.plan.against == "passes":
-        figures = {name: plot_against_passes(results), **figures}
-    elif any(len(results.lengths(curve)) > 1 for curve in results.curves):
-        figures = {name: plot_against_iterations(results), **figures}
-    pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
-    time = f"Training took {results.seconds / 60:.1f} min of one core."
-    notes = [*_origin(folder), time, f"Numbers: {name}.csv"]
-    return Section(f"{name}: {results.plan.data}, {results.plan.title}", pictures, judged, notes)
+    pictures = [(caption, save(folder, caption, figure)) for caption, figure in figures.items()]
+    return Section(title, pictures, judged, [*notes, f"Numbers: {name}.csv"], rule)
 
 
-def _report_worth(folder: Path) -> Section:
-    """The same of a comparison of samplers."""
-    worth = read_worth(folder)
-    if not worth.data_sets:
-        raise NothingMeasuredError(f"{folder} has no records yet")
-    figures, judged, notes = write_worth(worth, folder)
-    pictures = [(title, save(folder, title, figure)) for title, figure in figures.items()]
-    return Section(worth.plan.title, pictures, judged, [*_origin(folder), *notes], WORTH_RULE)
+def _check_measured(folder: Path, measured: bool) -> None:
+    if not measured:
+        command = shlex.join(["memcomp-train", f"resume={folder}"])
+        raise UserError(f"{folder} has no records yet: go on with {command}")
 
 
 def save(folder: Path, name: str, figure: Figure) -> bytes:
@@ -69,15 +68,5 @@ def save(folder: Path, name: str, figure: Figure) -> bytes:
         figure.savefig(buffer, format=suffix, dpi=130)
         with written_whole(folder / f"{name}.{suffix}") as path:
             path.write_bytes(buffer.getvalue())
-    with event_file(folder) as writer:
-        if writer is not None:
-            writer.add_figure(name, figure, close=False)
+    write_event_file(folder, lambda writer: writer.add_figure(name, figure, close=False))
     return buffer.getvalue()
-
-
-def _origin(folder: Path) -> list[str]:
-    path = folder / "origin.json"
-    if not path.exists():
-        return []
-    origin: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return [", ".join(f"{key} {value}" for key, value in origin.items())]

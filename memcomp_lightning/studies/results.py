@@ -1,12 +1,10 @@
 """The records of a figure as curves, points and tables."""
 
-import csv
-import io
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require_choice
+from memcomp_lightning.files import as_csv
 from memcomp_lightning.studies.records import Record, Records
 
 
@@ -111,13 +110,13 @@ class Results:
         self.chosen: dict[str, float | None] = {curve: records.best_value(curve) for curve in plan.labels}
         self._values: dict[str, dict[int, dict[int, NDArray[np.float64]]]] = {}
         self.seconds = sum(record.seconds[-1] for record in records.all)
+        seeds = {record.seed for record in records.all if not record.choosing}
         for curve in plan.labels:
-            by_length: dict[int, list[NDArray[np.float64]]] = {}
-            seeds = {record.seed for record in records.all if not record.choosing}
+            by_length = defaultdict(list)
             for record in records.of(curve):
                 early = curve in plan.stop_early
                 accuracy = at_best_validation(record) if early else record.measured("test_accuracy")
-                by_length.setdefault(record.iterations or 0, []).append(accuracy)
+                by_length[record.iterations or 0].append(accuracy)
             # A point counts once all seeds have trained: differences are between pairs.
             whole = {n: parts for n, parts in by_length.items() if len(parts) == len(seeds)}
             if whole:
@@ -126,7 +125,7 @@ class Results:
                     for n, parts in whole.items()
                 }
 
-    @cached_property
+    @property
     def curves(self) -> list[str]:
         """Curves of which something was measured, in the order of the legend."""
         return list(self._values)
@@ -146,6 +145,10 @@ class Results:
         error = float(values.std(ddof=1)) / math.sqrt(n) if n > 1 else math.nan
         return Point(float(values.mean()), error, n)
 
+    def last(self, curve: str, passes: int) -> Point:
+        """The point of most pretraining iterations."""
+        return self.point(curve, self.lengths(curve)[-1], passes)
+
     def label(self, curve: str) -> str:
         """Name of a curve, with the value that was chosen for it."""
         value = self.chosen.get(curve)
@@ -154,15 +157,13 @@ class Results:
 
     def table(self) -> str:
         """Every point as CSV."""
-        rows: list[list[Any]] = [["curve", "label", "iterations", "passes", "mean", "standard_error", "n"]]
+        rows: list[list[object]] = [["curve", "label", "iterations", "passes", "mean", "standard_error", "n"]]
         for curve in self.curves:
             for iterations in self.lengths(curve):
                 for passes in self.plan.passes:
                     point = self.point(curve, iterations, passes)
                     rows.append([curve, self.label(curve), iterations, passes, *point])
-        buffer = io.StringIO()
-        csv.writer(buffer, lineterminator="\n").writerows(rows)
-        return buffer.getvalue()
+        return as_csv(rows)
 
 
 def at_best_validation(record: Record) -> NDArray[np.float64]:

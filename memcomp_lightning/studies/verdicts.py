@@ -102,7 +102,7 @@ def _needs_fewer_iterations(results: Results, claim: Claim, passes: int) -> Verd
 def _is_above(results: Results, claim: Claim, passes: int) -> Verdict:
     names, last = results.plan.labels, results.lengths(claim.better)[-1]
     gain = vertical_arrow(results, claim, passes)
-    better, than = (results.point(c, results.lengths(c)[-1], passes) for c in (claim.better, claim.than))
+    better, than = results.last(claim.better, passes), results.last(claim.than, passes)
     return Verdict(
         f"{names[claim.better]} is above {names[claim.than]} at N = {last} (after {passes} passes)",
         f"{better} against {than}",
@@ -116,11 +116,11 @@ def _against_passes(results: Results, claim: Claim) -> list[Verdict]:
     names = results.plan.labels
     passes = results.plan.passes[-1]
     gain = vertical_arrow(results, claim, passes)
-    a, b = (results.point(curve, results.lengths(curve)[-1], passes) for curve in (second, first))
+    a, b = results.last(second, passes), results.last(first, passes)
     fewer = (a.mean - b.mean) / (1 - b.mean)
     measured = f"{a.mean:.4f} ± {a.error:.4f} against {b.mean:.4f} ± {b.error:.4f}"
     by_control = explaining(results, claim, passes, gain)
-    best = max(results.plan.passes, key=lambda p: results.point(first, results.lengths(first)[-1], p).mean)
+    best = max(results.plan.passes, key=lambda p: results.last(first, p).mean)
     at_best = compare(_at_last(results, second, passes), _at_last(results, first, best))
     return [
         Verdict(
@@ -137,7 +137,7 @@ def _against_passes(results: Results, claim: Claim) -> list[Verdict]:
         ),
         Verdict(
             f"{names[second]} (after {passes} passes) is above {names[first]} at its best pass ({best})",
-            f"{a.mean:.4f} against {results.point(first, results.lengths(first)[-1], best).mean:.4f}",
+            f"{a.mean:.4f} against {results.last(first, best).mean:.4f}",
             str(at_best),
             *_verdict(results, at_best.is_gain, explaining(results, claim, passes, at_best)),
         ),

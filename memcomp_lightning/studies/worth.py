@@ -1,16 +1,16 @@
 """Comparisons of samplers by likelihood: each at its best learning rate, and what mode assistance brings."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_choice, require_count, require_some
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.records import Record, Records, best
 from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
@@ -18,19 +18,7 @@ from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
 
 @dataclass(frozen=True, kw_only=True)
 class DataSet:
-    """A data set that methods are compared on; what is None here, the :class:`Comparison` says.
-
-    Attributes:
-        label: For people.
-        overrides: Of its runs, as on the command line.
-        passes: Of training, for a method of usual length.
-        measure: A name in :data:`MEASURES`.
-        methods: Names of those that are trained; None for all.
-        rates: Learning rates that are tried.
-        replicas: Seeds that are reported.
-        choosing: Further seeds that choose the learning rate.
-        points: Measurements along a training.
-    """
+    """A data set that methods are compared on; what is None here, the :class:`Comparison` says."""
 
     label: str
     overrides: list[str]
@@ -49,7 +37,7 @@ class Method:
 
     Attributes:
         label: For people.
-        overrides: Of its runs.
+        overrides: Of its runs, as on the command line.
         longer: Times as many passes as usual, > 0.
         rates: Learning rates that are tried, unless the data set names some.
         greedy_start: Share of the passes that is spent on greedy pretraining first, in [0, 1).
@@ -64,23 +52,7 @@ class Method:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """What is compared: the settings of ``conf/worth``.
-
-    Attributes:
-        name: Of the configuration.
-        title: For people.
-        replicas: Seeds that are reported, >= 1.
-        choosing: Further seeds that choose the learning rate, >= 1.
-        rates: Learning rates that are tried.
-        points: Measurements along a training, evenly spaced in the logarithm of the updates, >= 1.
-        gradient_draws: Draws of the negative phase whose mean gradient is compared with the exact one, >= 1.
-        only: Names of the data sets to train on; None for all.
-        data_sets: By name.
-        methods: By name.
-        claimed: Methods that are judged.
-        baselines: Methods that they are judged against.
-        workers: Processes; None is one for each core.
-    """
+    """What is compared: the settings of ``conf/worth``, which explains them. Numbers are >= 1."""
 
     name: str
     title: str
@@ -99,8 +71,8 @@ class Comparison:
     def __post_init__(self) -> None:
         for key in ("replicas", "choosing", "points", "gradient_draws"):
             require_count(f"worth.{key}", getattr(self, key))
-        _require_some("worth.rates", self.rates, "at least one learning rate")
-        _require_some("worth.only", self.only, "names of data sets, or null for all")
+        require_some("worth.rates", self.rates, "at least one learning rate")
+        require_some("worth.only", self.only, "names of data sets, or null for all")
         for name in self.only or ():
             require_choice("worth.only", name, tuple(self.data_sets))
         for name in (*self.claimed, *self.baselines):
@@ -110,24 +82,21 @@ class Comparison:
             require_choice(f"{at}.measure", data_set.measure, tuple(MEASURES))
             require_count(f"{at}.passes", data_set.passes)
             for key in ("replicas", "choosing", "points"):
-                require_count(f"{at}.{key}", 1 if getattr(data_set, key) is None else getattr(data_set, key))
+                if getattr(data_set, key) is not None:
+                    require_count(f"{at}.{key}", getattr(data_set, key))
             for key in ("methods", "rates"):
-                _require_some(f"{at}.{key}", getattr(data_set, key), "at least one, or leave it out")
+                require_some(f"{at}.{key}", getattr(data_set, key), "at least one, or leave it out")
             for known in data_set.methods or ():
                 require_choice(f"{at}.methods", known, tuple(self.methods))
         for name, method in self.methods.items():
             at = f"worth.methods.{name}"
             require(method.longer > 0, f"{at}.longer", method.longer, "a number > 0")
             require(0 <= method.greedy_start < 1, f"{at}.greedy_start", method.greedy_start, "a share in [0, 1)")
-            _require_some(f"{at}.rates", method.rates, "at least one, or leave it out")
+            require_some(f"{at}.rates", method.rates, "at least one, or leave it out")
 
     def n_reported(self, data_set: str) -> int:
         """Replicas of a data set that are reported."""
         return self.data_sets[data_set].replicas or self.replicas
-
-
-def _require_some(name: str, values: Sequence[Any] | None, allowed: str) -> None:
-    require(values is None or len(values) > 0, name, values, allowed)
 
 
 class End(NamedTuple):
@@ -194,11 +163,8 @@ class Worth:
 
         The quickest one always counts; None if no baseline was measured.
         """
-        seconds = {
-            name: self.end(data_set, name).seconds
-            for name in self.plan.baselines
-            if name in self.methods(data_set)
-        }
+        measured = [name for name in self.plan.baselines if name in self.methods(data_set)]
+        seconds = {name: self.end(data_set, name).seconds for name in measured}
         if not seconds:
             return None
         limit = max(1.1 * self.end(data_set, method).seconds, min(seconds.values()))
@@ -279,11 +245,8 @@ def read_worth(folder: Path) -> Worth:
     path = folder / "worth.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no worth.json: name the folder of experiment=sampler_worth.")
-    return Worth(comparison_of(json.loads(path.read_text(encoding="utf-8"))), Records(folder).all)
-
-
-def comparison_of(settings: Mapping[str, Any]) -> Comparison:
-    """From the plain values of ``worth.json``."""
+    settings = json.loads(path.read_text(encoding="utf-8"))
     data_sets = {name: DataSet(**values) for name, values in settings["data_sets"].items()}
     methods = {name: Method(**values) for name, values in settings["methods"].items()}
-    return Comparison(**{**settings, "data_sets": data_sets, "methods": methods})
+    plan = Comparison(**{**settings, "data_sets": data_sets, "methods": methods})
+    return Worth(plan, Records(folder).all)

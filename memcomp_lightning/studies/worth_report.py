@@ -1,41 +1,21 @@
-"""The report of ``experiment=sampler_worth``: pictures, table, verdicts, and a layout for TensorBoard."""
+"""What TensorBoard shows of ``experiment=sampler_worth``: curves, and a layout for them."""
 
-import csv
-import io
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from memcomp_lightning.files import write_text
-from memcomp_lightning.studies.event_files import event_file
+from memcomp_lightning.studies.event_files import write_event_file
 from memcomp_lightning.studies.measures import MEASURES
-from memcomp_lightning.studies.page import markdown
-from memcomp_lightning.studies.plot_worth import plot_worth
-from memcomp_lightning.studies.verdicts import Verdict
-from memcomp_lightning.studies.worth import Worth, worth_table, worth_verdicts
+from memcomp_lightning.studies.worth import Worth
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-NUMBERS = "sampler_worth.csv"
 
-
-def write_worth(worth: Worth, folder: Path) -> tuple[dict[str, Figure], list[Verdict], list[str]]:
-    """Write table, verdicts and events into a folder; return pictures, verdicts and notes for the page."""
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(worth_table(worth))
-    write_text(folder / NUMBERS, buffer.getvalue())
-    judged = worth_verdicts(worth)
-    write_text(folder / "verdicts.md", markdown(judged))
-    _write_events(worth, folder / "tensorboard")
-    figures = {name: plot_worth(worth, name) for name in worth.data_sets}
-    return figures, judged, [f"Numbers: {NUMBERS}"]
-
-
-def _write_events(worth: Worth, folder: Path) -> None:
+def write_events(worth: Worth, folder: Path) -> None:
     """A run for each method at its best rates, a group of charts for each data set, settings in the HParams tab.
 
     One run for all data sets: TensorBoard shows nothing at first where there are more than forty.
@@ -47,27 +27,23 @@ def _write_events(worth: Worth, folder: Path) -> None:
         measure = settings.measure
         name = MEASURES[measure].title
         tags = {
-            f"{name}: median over replicas": [f"{data_set}/{measure}/median"],
-            f"{name}: worst replica": [f"{data_set}/{measure}/worst"],
-            "gradient: cosine with the exact one": [f"{data_set}/gradient/cosine"],
-            "gradient: relative error": [f"{data_set}/gradient/relative_error"],
+            f"{name}: median over replicas": f"{data_set}/{measure}/median",
+            f"{name}: worst replica": f"{data_set}/{measure}/worst",
+            "gradient: cosine with the exact one": f"{data_set}/gradient/cosine",
+            "gradient: relative error": f"{data_set}/gradient/relative_error",
         }
-        charts[settings.label] = {title: ["Multiline", names] for title, names in tags.items()}
+        charts[settings.label] = {title: ["Multiline", [tag]] for title, tag in tags.items()}
     for method, own in worth.plan.methods.items():
         found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
         if found:
-            with event_file(folder / own.label) as writer:
-                if writer is not None:
-                    _write_method(worth, method, found, writer)
-    with event_file(folder) as writer:
-        if writer is not None:
-            writer.add_custom_scalars(charts)
+            write_event_file(folder / own.label, partial(_write_method, worth, method, found))
+    write_event_file(folder, lambda writer: writer.add_custom_scalars(charts))
 
 
 def _write_method(worth: Worth, method: str, data_sets: list[str], writer: "SummaryWriter") -> None:
     from torch.utils.tensorboard.summary import hparams
 
-    settings: dict[str, Any] = {"method": worth.plan.methods[method].label}
+    settings: dict[str, object] = {"method": worth.plan.methods[method].label}
     final = {}
     for data_set in data_sets:
         record, measure = worth.best(data_set, method), worth.plan.data_sets[data_set].measure

@@ -114,6 +114,13 @@ class LearningRateDecay:
             group["lr"] = group.setdefault("initial_lr", group["lr"]) * self.factor(iteration)
 
 
+def check_schedules(schedules: Sequence[Schedule], optimizers: Sequence[Optimizer]) -> None:
+    """Raise a SettingError unless all schedules can change all optimisers."""
+    for schedule in schedules:
+        for optimizer in optimizers:
+            schedule.check(optimizer)
+
+
 def begin_pass(schedules: Sequence[Schedule], optimizer: Optimizer, iteration: int) -> None:
     """Let all schedules set what a pass needs."""
     for schedule in schedules:

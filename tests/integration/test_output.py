@@ -20,7 +20,6 @@ from numba import njit
 from running import Outcome
 
 from memcomp_lightning import compiling, plotting
-from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.commands import solve as solving
 from memcomp_lightning.cli.output import say, tolerant_streams
 from memcomp_lightning.cli.overrides import claimed
@@ -329,7 +328,7 @@ def test_advice_of_the_report_works_when_pasted(
     for name in ("figure.json", "worth.json"):
         (folder / name).touch()
         with pytest.raises(UserError) as refused:
-            report._section(folder)
+            study_report.write_report(folder)
         assert shell.arguments(str(refused.value).partition("go on with ")[2]) == [f"resume={folder}"]
 
 

@@ -4,14 +4,13 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from memcomp_lightning.cli.arguments import as_typed
 from memcomp_lightning.cli.output import refuse, say
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.table import aligned, short_path
-from memcomp_lightning.studies.page import Section, page
-from memcomp_lightning.studies.report import NothingMeasuredError, write_report
+from memcomp_lightning.studies.page import page
+from memcomp_lightning.studies.report import write_report
 from memcomp_lightning.studies.verdicts import Verdict
 
 COMMAND = "memcomp-report"
@@ -25,16 +24,6 @@ def verdict_table(judged: Sequence[Verdict]) -> str:
     return aligned(rows)
 
 
-def _section(folder: Path) -> Section:
-    try:
-        return write_report(folder)
-    except FileNotFoundError as error:
-        raise UserError(str(error)) from error
-    except NothingMeasuredError as error:
-        command = as_typed("memcomp-train", f"resume={folder}")
-        raise UserError(f"{error}: go on with {command}") from error
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(
@@ -46,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.error = lambda message: refuse(COMMAND, UserError(f"{message}. {COMMAND} --help shows how."))  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
     try:
-        sections = [_section(folder) for folder in given.folders]
+        sections = [write_report(folder) for folder in given.folders]
         output = given.output or given.folders[0] / "report.html"
         write_text(output, page(sections))
     except (UserError, SettingError) as error:
