@@ -2,6 +2,7 @@
 
 import difflib
 import glob
+import os
 import re
 import shlex
 import unicodedata
@@ -97,24 +98,22 @@ def read(arguments: Sequence[str]) -> CommandLine:
     parser.allow_abbrev = False
     parser.error = _refuse_flag  # type: ignore[method-assign]
     given, unknown = parser.parse_known_intermixed_args(list(arguments))
-    flags = {option for action in parser._actions for option in action.option_strings}
-    for argument in unknown:
-        _refuse_unknown(argument, sorted(flags))
+    if unknown:
+        _refuse_unknown(unknown[0], sorted(parser._option_string_actions))
     for name, remedy in REFUSED.items():
         if getattr(given, name) is not None:
-            raise UserError(f"--{name.replace('_', '-')} {getattr(given, name)} is not possible. {remedy}")
+            raise UserError(f"{_flag(name)} {getattr(given, name)} is not possible. {remedy}")
     mode = next((o for o in reversed(given.overrides) if o.startswith("hydra.mode=")), "").upper()
     multirun = given.multirun or mode == "HYDRA.MODE=MULTIRUN"
     shown = [name for name in SHOWING if getattr(given, name) not in (None, False)]
     if len(shown) + multirun + given.run > 1:
-        typed = [f"--{name.replace('_', '-')}" for name in [*shown, *["run"] * given.run, *["-m"] * multirun]]
-        raise UserError(f"{' and '.join(typed).replace('---', '-')}: take one of them at a time.")
+        typed = [*map(_flag, shown), *["--run"] * given.run, *["-m"] * multirun]
+        raise UserError(f"{' and '.join(typed)}: take one of them at a time.")
     if given.package is not None and not given.cfg:
         raise UserError(f"--package {given.package} is a part of what --cfg shows: add --cfg job.")
     if given.resolve and not (given.cfg or given.help):
         raise UserError("--resolve is for what --cfg and --help show: add --cfg job.")
-    shows = [f"--{name.replace('_', '-')}" for name in shown]
-    shows += [value for value in (given.cfg, given.info) if value is not None]
+    shows = [*map(_flag, shown), *(value for value in (given.cfg, given.info) if value is not None)]
     shows += ["--resolve"] if given.resolve else []
     overrides = given.overrides
     if given.shell_completion:
@@ -124,6 +123,10 @@ def read(arguments: Sequence[str]) -> CommandLine:
         overrides = [_readable(override, multirun=multirun) for override in overrides]
     folder = None if given.config_dir is None else Path(expanded("--config-dir", given.config_dir)).absolute()
     return CommandLine(tuple(overrides), multirun, tuple(shows), folder, given.package)
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def unquoted(text: str) -> str:
@@ -159,10 +162,9 @@ def parse(override: str) -> Override:
         UserError: Naming it, and how to write it.
     """
     try:
-        (parsed,) = OverridesParser.create().parse_overrides([override])
+        return OverridesParser.create().parse_override(override)
     except HydraException:
         raise UserError(f"{override} cannot be read: {_trouble(override)}") from None
-    return parsed
 
 
 def _readable(override: str, *, multirun: bool) -> str:
@@ -218,14 +220,13 @@ def _path(name: str, text: str, *, swept: bool) -> str:
             raise UserError(f"{name}={text} matches no file in {Path.cwd()}.")
         if len(files) > 1 and not swept:
             raise UserError(f"{name}={text} stands for {len(files)} files, the jobs of a sweep: add -m.")
-        return f"{name}={','.join(with_path('', file)[1:] for file in files)}"
+        return f"{name}={','.join(map(_quoted, files))}"
     if swept and ("," in text or "(" in text):
-        separate = re.fullmatch(r"[^'\"()\[\]{}]+", text) is not None
-        if not separate:
+        if re.search(r"['\"()\[\]{}]", text):
             parse(f"{name}={text}")
             return f"{name}={text}"
         paths = [expanded(name, part.strip()) for part in text.split(",")]
-        return f"{name}={','.join(with_path('', path)[1:] for path in paths)}"
+        return f"{name}={','.join(map(_quoted, paths))}"
     return with_path(name, expanded(name, text))
 
 
@@ -235,24 +236,25 @@ def with_path(name: str, path: Path | str) -> str:
     >>> with_path("hydra.run.dir", "my runs/a,b")
     "hydra.run.dir='my runs/a,b'"
     """
-    text = str(path)
+    return f"{name}={_quoted(str(path))}"
+
+
+def _quoted(text: str) -> str:
     if _value(text) == text:
-        return f"{name}={text}"
+        return text
     escaped = re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\\'", text))
-    return f"{name}='{escaped}'"
+    return f"'{escaped}'"
 
 
-def _value(text: str) -> Any:
-    """The value that Hydra reads; ``_Unreadable``, which equals no value, where it cannot read the text."""
+_UNREADABLE = object()
+
+
+def _value(text: str) -> object:
+    """The value that Hydra reads; ``_UNREADABLE``, which equals no value, where it cannot read the text."""
     try:
-        (parsed,) = OverridesParser.create().parse_overrides([f"x={text}"])
+        return OverridesParser.create().parse_override(f"x={text}").value()
     except HydraException:
-        return _Unreadable
-    return parsed.value()
-
-
-class _Unreadable:
-    """In place of a value."""
+        return _UNREADABLE
 
 
 def expanded(name: str, text: str) -> str:
@@ -284,15 +286,11 @@ def _absolute_search_path(override: str) -> str:
     for place in value if isinstance(value, list) else [value]:
         scheme, separator, rest = str(place).rpartition("://")
         places.append(str(place) if separator and scheme != "file" else f"file://{Path(rest).absolute()}")
-    quoted = (with_path("", place)[1:] for place in places)
-    return f"{_SEARCH_PATH}=[{','.join(quoted)}]"
+    return f"{_SEARCH_PATH}=[{','.join(map(_quoted, places))}]"
 
 
-def _is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except (OSError, ValueError):  # the name is too long, or has a zero in it
-        return False
+_is_file = os.path.isfile
+"""Unlike the method of a path, it raises for no name: one that is too long, or has a zero in it."""
 
 
 def _check_signs(argument: str) -> None:

@@ -94,7 +94,8 @@ def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWra
     raw = getattr(buffer, "raw", buffer)
     if isinstance(raw, _Tolerant):
         return stream
-    _flush(stream)
+    with suppress(OSError, ValueError):
+        stream.flush()
     tolerant: Any = _Tolerant(raw, stream.name, failures)
     if raw is not buffer:  # not under python -u
         tolerant = io.BufferedWriter(tolerant)
@@ -105,11 +106,6 @@ def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWra
         line_buffering=stream.line_buffering,
         write_through=stream.write_through,
     )
-
-
-def _flush(stream: io.TextIOWrapper) -> None:
-    with suppress(OSError, ValueError):
-        stream.flush()
 
 
 def _hand_over(stream: io.TextIOWrapper, tolerant: io.TextIOWrapper) -> None:

@@ -5,7 +5,7 @@ import itertools
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.resources import files
@@ -22,14 +22,12 @@ from omegaconf.errors import OmegaConfBaseException
 from memcomp_lightning.cli.arguments import CommandLine, parse
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.configuration.composition import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
-from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, explain, unknown_setting
+from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_exists, explain
 from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.paths import is_path
 
 _SEARCHES = ("hparams=", "hydra/sweeper=")
-
-_SET_BY_EXPERIMENTS = ("figure", "worth")
 
 LONGEST_NAME = 150
 """Characters of a job's folder; file systems allow 255."""
@@ -168,9 +166,12 @@ def _composed(config_name: str, job: Sequence[str], paths: Sequence[str]) -> Dic
     except CONFIGURATION_ERRORS:
         groups = GlobalHydra.instance().config_loader().list_groups("")
         plain = compose(config_name, list(paths))
-        _raise_first(unknown_setting(o, plain, groups) for o in job if "." not in o.partition("=")[0])
+        for override in job:
+            if "." not in override.partition("=")[0]:
+                check_exists(override, plain, groups)
         defaults = compose(config_name, [*paths, *(o for o in job if _chooses_group(o))])
-        _raise_first(unknown_setting(override, defaults, groups) for override in job)
+        for override in job:
+            check_exists(override, defaults, groups)
         raise
 
 
@@ -191,21 +192,17 @@ def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[s
         name, typed = override.key_or_group, override.input_line
         if "/" in name or "@" in name or override.package is not None:
             continue
+        adds = override.is_add() or override.is_force_add()
         known = f"Known here: {', '.join(loader.get_group_options(name))}." if name in groups else ""
         if override.is_delete() and name in plain():
             instead = f"Choose another option with {name}=NAME. {known}" if known else f"Give it: {name}=VALUE."
             raise UserError(f"{typed} is not possible: {name} is needed. {instead}")
-        if (
-            name in groups
-            and (override.is_add() or override.is_force_add())
-            and name in plain().hydra.runtime.choices
-        ):
+        if name in groups and adds and name in plain().hydra.runtime.choices:
             raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
-        if name in _SET_BY_EXPERIMENTS and not (override.is_add() or override.is_force_add()):
-            raise UserError(
-                f"{typed} is not possible: an experiment sets it. Write experiment=NAME. Known here: "
-                f"{', '.join(loader.get_group_options('experiment'))}."
-            )
+        if name in ("figure", "worth") and not adds:
+            experiments = ", ".join(loader.get_group_options("experiment"))
+            remedy = f"Write experiment=NAME. Known here: {experiments}."
+            raise UserError(f"{typed} is not possible: an experiment sets it. {remedy}")
         if name in groups and not override.is_delete() and not override.is_sweep_override():
             value = override.value()
             allowed = value is None and plain().hydra.runtime.choices.get(name) is None
@@ -249,14 +246,14 @@ def _naming_override(message: str, job: Sequence[str]) -> str:
     given = {o: o.lstrip("+~").partition("=")[::2] for o in job}
     if any(name in message or f"{name.rpartition('.')[0] or name}:" in message for name, _ in given.values()):
         return message
-    meant = {
-        override: value
+    meant = [
+        (override, value)
         for override, (name, value) in given.items()
         if value and not is_path(name) and re.search(rf"(?<!\w){re.escape(value)}(?!\w)", message)
-    }
+    ]
     if len(meant) != 1:
         return message
-    ((override, value),) = meant.items()
+    override, value = meant[0]
     remedy = " Write true or false." if value.lower() in ("yes", "no", "on", "off") else ""
     return f"{override}: {message}{remedy}"
 
@@ -274,11 +271,7 @@ def _check_groups(folder: Path) -> None:
 
 
 def search_path(settings: HydraConf) -> list[str]:
-    """Where a run looks for groups besides our own, by ``--config-dir`` or ``hydra.searchpath``, as an override.
-
-    Args:
-        settings: Hydra's, of a run.
-    """
+    """Where a run looks for groups besides ours, by ``--config-dir`` or ``hydra.searchpath``, as an override."""
     sources = [source for source in settings.runtime.config_sources if "command-line" in source.provider]
     return [_searching(*(f"{source.schema}://{source.path}" for source in sources))] if sources else []
 
@@ -312,10 +305,4 @@ def _check_writable(folder: Path, key: str) -> None:
 
 def _chooses_group(override: str) -> bool:
     name, _, value = override.partition("=")
-    return "." not in name and name not in ("seed",) and bool(value)
-
-
-def _raise_first(messages: Iterable[str | None]) -> None:
-    for message in messages:
-        if message is not None:
-            raise UserError(message)
+    return "." not in name and name != "seed" and bool(value)

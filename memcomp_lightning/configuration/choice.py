@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 from memcomp_lightning.configuration.plans import plan_of
 from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.studies import AccuracyTrial, Records, SideBySide, best
+from memcomp_lightning.studies import AccuracyTrial, Records, SideBySide
 
 HELD_OUT = 0.1
 """Share of the training images that judge, unless ``data.validation_fraction`` sets one."""
@@ -62,14 +62,7 @@ def for_trial(config: DictConfig, value: float) -> DictConfig:
 def trial_of(
     config: DictConfig, method: str, *, value: float | None = None, choosing: bool = False
 ) -> AccuracyTrial:
-    """A training with these settings.
-
-    Args:
-        config: Of one run; with a value to choose, before the choice.
-        method: Name of the trial.
-        value: Of the setting that is chosen; None where nothing is.
-        choosing: Whether the value is only tried.
-    """
+    """A training with these settings of one run, and the value of what is to be chosen; None where nothing is."""
     own = config
     if value is not None:
         own = for_trial(config, value) if choosing else with_choice(config, value)
@@ -103,9 +96,8 @@ def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str,
                 "Trial %d of %d: %s = %s, accuracy %.4f on held-out training images",
                 *(number, len(values), setting, value, records.all[-1].held_out),
             )
-    chosen = best(records.all)
+    chosen = records.best_value("choose")
     assert chosen is not None
-    assert chosen.value is not None
     accuracies = [record.held_out for record in records.all]
-    found = {"setting": setting, "value": chosen.value, "values": values, "accuracies": accuracies}
-    return with_choice(config, chosen.value), found
+    found = {"setting": setting, "value": chosen, "values": values, "accuracies": accuracies}
+    return with_choice(config, chosen), found

@@ -70,30 +70,34 @@ def in_words(error: BaseException) -> str:
     return f"no module {error.name}: install it, or put the folder that holds its file on PYTHONPATH."
 
 
-def unknown_setting(override: str, defaults: DictConfig, groups: Collection[str] = ()) -> str | None:
-    """Return a message if an override names a setting that does not exist, with what is close.
+def check_exists(override: str, defaults: DictConfig, groups: Collection[str]) -> None:
+    """Raise if an override names a setting that does not exist.
 
     Args:
         override: As typed: ``pretrain.iteration=20``.
         defaults: A composed configuration of the same groups.
         groups: The groups; not all of them appear in the configuration.
+
+    Raises:
+        UserError: With what is close.
     """
     name, equals, _ = override.partition("=")
     if name[:1] in ("+", "~") or "@" in name or "/" in name or name.partition(".")[0] == "hydra":
-        return None
+        return
     if not equals:
-        return f"{override} is no setting: expected NAME=VALUE."
+        raise UserError(f"{override} is no setting: expected NAME=VALUE.")
     parent, _, leaf = name.rpartition(".")
     node = OmegaConf.select(defaults, parent) if parent else defaults
     if isinstance(node, DictConfig):
         if leaf in node or name in groups:
-            return None
+            return
         known = sorted(f"{parent}.{key!s}".lstrip(".") for key in node)
     else:
         known = sorted(str(key) for key in defaults)
     close = _nearest(name, known)
     hint = f" Did you mean {close[0]}?" if close else ""
-    return f"setting {name} (given as {override}) does not exist.{hint} Known here: {', '.join(known)}."
+    listed = ", ".join(known)
+    raise UserError(f"setting {name} (given as {override}) does not exist.{hint} Known here: {listed}.")
 
 
 def _nearest(name: str, known: Collection[str]) -> list[str]:

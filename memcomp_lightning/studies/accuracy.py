@@ -154,14 +154,11 @@ def grouped(
 ) -> list[SideBySide]:
     """Put trials together that can be fine-tuned as one program; the longest programs come first.
 
-    Args:
-        trials: Networks to train.
-        passes: Fine-tuning passes after which they are tested.
-        networks: Replicas in a program, about; None is what a CPU core or a GPU trains fastest.
+    A program has about as many replicas as ``networks`` says; None is what a CPU core or a GPU trains fastest.
     """
-    groups: dict[str, list[AccuracyTrial]] = {}
+    groups = defaultdict(list)
     for trial in trials:
-        groups.setdefault(trial.fine_tuning, []).append(trial)
+        groups[trial.fine_tuning].append(trial)
     programs = []
     for alike in groups.values():
         data = tuning(plan_of(alike[0], passes[-1])).data

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -50,7 +50,10 @@ def train(config: DictConfig) -> float | None:
         job that diverged. None where no images are held out, or a job failed.
     """
     settings = HydraConfig.get()
-    _begin_job(settings.runtime.cwd)
+    # Again: a parallel launcher starts jobs in processes of their own.
+    make_tolerant()
+    _silence_lightning()
+    os.chdir(settings.runtime.cwd)  # paths are meant from there, with hydra.job.chdir=true, too
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
@@ -67,17 +70,9 @@ def train(config: DictConfig) -> float | None:
 
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
-    if config.worth is not None:
-        comparisons.check(config, overrides)
-        return
-    if config.figure is not None:
-        if not {"name", "all"} & set(config.figure):
-            raise UserError(
-                "preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick."
-            )
-        for part, own in figures.parts(config, overrides).values():
-            check = trajectory.check if "curves" not in part.figure else figures.check
-            check(part, own)
+    if config.figure is not None or config.worth is not None:
+        for study, part, own in _studies(config, overrides).values():
+            study.check(part, own)
         return
     for name, logger in config.logger.items():
         writes_events = logger is not None and str(logger.get("_target_")).endswith("TensorBoardLogger")
@@ -95,6 +90,16 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     check_trainers(plans[0], config)
 
 
+def _studies(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[ModuleType, DictConfig, list[str]]]:
+    """What checks and trains a comparison, or each figure of a run, with its settings, by the folder of each."""
+    if config.worth is not None:
+        return {".": (comparisons, config, list(overrides))}
+    if not {"name", "all"} & set(config.figure):
+        raise UserError("preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick.")
+    parts = figures.parts(config, overrides).items()
+    return {name: (figures if "curves" in part.figure else trajectory, part, own) for name, (part, own) in parts}
+
+
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float | None:
     if config.figure is not None or config.worth is not None:
         _many(config, folder, overrides)
@@ -106,7 +111,8 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
         try:
             config, choice = settle(config, folder)
             loggers = [instantiate(logger) for logger in config.logger.values() if logger is not None]
-            by_name = _by_name(overrides)
+            pairs = [override.partition("=") for override in overrides if not override.startswith("hydra.")]
+            by_name = {name: value for name, _, value in pairs}
             result = pipeline.run(
                 build(config),
                 folder,
@@ -132,17 +138,11 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     folder.open(config, overrides)
     folder.check_source()
     try:
-        if config.worth is not None:
-            comparisons.train(config, overrides, folder.path)
-            trained = [folder.path]
-        else:
-            trained = []
-            for name, (part, own) in figures.parts(config, overrides).items():
-                trained.append(folder.path / name)
-                trained[-1].mkdir(exist_ok=True)
-                train = trajectory.train if "curves" not in part.figure else figures.train
-                train(part, own, trained[-1])
-        report.main([*map(str, trained), "--output", str(folder.report)])
+        studies = _studies(config, overrides)
+        for name, (study, part, own) in studies.items():
+            (folder.path / name).mkdir(exist_ok=True)
+            study.train(part, own, folder.path / name)
+        report.main([*(str(folder.path / name) for name in studies), "--output", str(folder.report)])
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt(_go_on(folder)) from stop
     folder.forget_error()
@@ -155,11 +155,6 @@ def _go_on(folder: RunFolder) -> str:
 def _is_first_process() -> bool:
     """Whether this is the process that writes; Lightning reads the rank from the environment."""
     return int(getattr(rank_zero_only, "rank", 0)) == 0
-
-
-def _by_name(overrides: list[str]) -> dict[str, str]:
-    pairs = (override.partition("=") for override in overrides if not override.startswith("hydra."))
-    return {name: value for name, _, value in pairs}
 
 
 def _resumed(arguments: list[str]) -> list[str]:
@@ -182,12 +177,9 @@ def _resumed(arguments: list[str]) -> list[str]:
             f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
             "sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
         )
+    earlier = [from_folder(override, folder.typed_in) for override in overrides]
     others = [argument for argument in arguments if not argument.startswith("resume=")]
-    return [
-        *(from_folder(o, folder.typed_in) for o in overrides),
-        *others,
-        with_path("hydra.run.dir", folder.path),
-    ]
+    return [*earlier, *others, with_path("hydra.run.dir", folder.path)]
 
 
 def main() -> None:
@@ -233,17 +225,6 @@ def _read(arguments: list[str]) -> CommandLine:
     return line
 
 
-def _begin_job(folder: str) -> None:
-    """What a job needs in a process of its own, which a parallel launcher starts, and in the first one.
-
-    Args:
-        folder: Where the command was typed: paths are meant from there, with ``hydra.job.chdir=true``, too.
-    """
-    make_tolerant()
-    _silence_lightning()
-    os.chdir(folder)
-
-
 def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -251,9 +232,9 @@ def _silence_lightning() -> None:
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 
-def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, Any]:
+def _distinguishing_settings(config: DictConfig, overrides: dict[str, str]) -> dict[str, object]:
     """What tells runs of a sweep apart: TensorBoard shows the first five, and more where more was overridden."""
     choices = HydraConfig.get().runtime.choices
-    settings: dict[str, Any] = {group: choices[group] for group in ("data", "model", "sampler")}
+    settings = {group: choices[group] for group in ("data", "model", "sampler")}
     settings |= {"seed": config.seed, "pretrain.iterations": config.pretrain.iterations}
-    return {**settings, **{name: value for name, value in overrides.items() if name not in settings}}
+    return settings | {name: value for name, value in overrides.items() if name not in settings}
