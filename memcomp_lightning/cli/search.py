@@ -11,6 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from omegaconf import DictConfig, OmegaConf
 
+from memcomp_lightning.configuration.plans import require_held_out
 from memcomp_lightning.errors import UserError, require
 
 
@@ -55,16 +56,9 @@ def check_searchable(config: DictConfig) -> None:
     Raises:
         SettingError: Naming the setting.
     """
-    require(
-        config.figure is None and config.worth is None, "experiment", "one of many runs", "one run in a search"
-    )
-    require(
-        config.data.validation_fraction > 0,
-        "data.validation_fraction",
-        config.data.validation_fraction,
-        "a share above 0 of the training images in a search",
-        "The test images would choose the settings.",
-    )
+    is_one = config.figure is None and config.worth is None
+    require(is_one, "experiment", "one of many runs", "one run in a search")
+    require_held_out(config, "in a search", "settings")
     n_passes = config.finetune.iterations
     require(n_passes > 0, "finetune.iterations", n_passes, "an integer >= 1 in a search, which goes by accuracy")
 

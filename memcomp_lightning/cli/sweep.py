@@ -23,13 +23,9 @@ class RememberSweepFolder(Callback):
 
 
 def merge(folder: Path) -> tuple[str, int]:
-    """Merge the jobs of a sweep folder into one table and write it as ``table.csv``.
+    """Write the jobs of a sweep folder as ``table.csv``; return the table for the screen, and how many failed.
 
-    Rows are settings; mean and standard error are over seeds and replicas. Settings that all jobs share
-    are left out. Of figures and comparisons the reports are listed.
-
-    Returns:
-        The table with the failed jobs below it, and the number of these.
+    Rows are settings, see :func:`sweep_table`. Reports of figures and comparisons are listed, and failed jobs.
     """
     groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]] = defaultdict(list)
     failed: list[tuple[str, str]] = []

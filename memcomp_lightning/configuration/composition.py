@@ -35,10 +35,8 @@ def search_paths(overrides: Iterable[str]) -> list[str]:
 def composed_for(common: Iterable[str], own: Iterable[str] = ()) -> DictConfig:
     """The configuration of one curve or method, without settings of its study; cached, so do not change it.
 
-    Args:
-        common: Overrides of the whole study. Those for which this curve or method has no setting are left out:
-            ``solver.max_steps`` where its solver is descent.
-        own: Its own overrides, which must apply.
+    Overrides of the whole study that this curve or method has no setting for are left out: ``solver.max_steps``
+    where its solver is descent. Its own must apply.
     """
     common = tuple(common)
     of_one = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
@@ -67,12 +65,9 @@ def _applies(name: str, config: DictConfig) -> bool:
 
 
 def check_not_given(overrides: Iterable[str], instead: Mapping[str, str], of: str) -> None:
-    """Refuse overrides of what a study sets itself.
+    """Refuse overrides of what a study of this kind sets itself.
 
-    Args:
-        overrides: As typed.
-        instead: What to do in their place, by setting; OVERRIDE in it stands for what was typed.
-        of: The kind of study.
+    ``instead`` says what to do in their place, by setting; OVERRIDE in it stands for what was typed.
     """
     for override in overrides:
         typed = override.lstrip("+")

@@ -97,22 +97,13 @@ def build(config: DictConfig) -> Plan:
         )
         pretraining = Stage(module, data, callbacks)
     if config.finetune.iterations > 0:
-        require(
-            isinstance(network, DBN) or not models,
-            "finetune.iterations",
-            config.finetune.iterations,
-            "0 for a Boltzmann machine, which is no feed-forward network",
-            "For a deep one that is fine-tuned use model=dbn pretrain=joint.",
-        )
+        layered = isinstance(network, DBN) or not models
+        allowed = "0 for a Boltzmann machine, which is no feed-forward network"
+        remedy = "For a deep one that is fine-tuned use model=dbn pretrain=joint."
+        require(layered, "finetune.iterations", config.finetune.iterations, allowed, remedy)
         callbacks = _callbacks(config, "finetune")
         if config.finetune.keep_best:
-            require(
-                config.data.validation_fraction > 0,
-                "data.validation_fraction",
-                config.data.validation_fraction,
-                "a share above 0 of the training images where finetune.keep_best is true",
-                "The test images would choose the pass.",
-            )
+            require_held_out(config, "where finetune.keep_best is true", "pass")
             callbacks.append(BestWeights())
         schedules = _schedules(config, "finetune")
         make: Callable[..., Classifier] = partial(Classifier, network)
@@ -135,18 +126,20 @@ def build(config: DictConfig) -> Plan:
         finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
-    require(
-        bool(plan.stages),
-        "finetune.iterations",
-        config.finetune.iterations,
-        "an integer >= 1 where there is no pretraining",
-    )
+    allowed = "an integer >= 1 where there is no pretraining"
+    require(bool(plan.stages), "finetune.iterations", config.finetune.iterations, allowed)
     return plan
 
 
 def plan_of(settings: Mapping[str, Any]) -> Plan:
     """Build the objects of a run from its settings as plain values."""
     return build(OmegaConf.create(dict(settings)))
+
+
+def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
+    """Refuse a run without held-out images to choose something by."""
+    share, allowed = config.data.validation_fraction, f"a share above 0 of the training images {where}"
+    require(share > 0, "data.validation_fraction", share, allowed, f"The test images would choose the {chosen}.")
 
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:
@@ -224,16 +217,9 @@ def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
 
 
 def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
+    settings = {str(name): value for name, value in config.data.items() if name != "source"}
     try:
-        return ImageDataModule(
-            images,
-            batch_size=config[stage].batch_size,
-            partitions=config.data.partitions,
-            first_partitions=config.data.first_partitions,
-            validation_fraction=config.data.validation_fraction,
-            chunk_size=config.data.chunk_size,
-            seed=config.seed,
-        )
+        return ImageDataModule(images, batch_size=config[stage].batch_size, seed=config.seed, **settings)
     except ValueError as error:
         raise UserError(f"{stage}, data: {error}") from error
 
@@ -258,13 +244,10 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
         kind = type(callback).__name__
         require(isinstance(callback, pl.Callback), f"callbacks.{stage}", kind, "callbacks of Lightning")
         check_callback(callback, f"callbacks.{stage}")
-        require(
-            not isinstance(callback, BestWeights | Schedules),
-            f"callbacks.{stage}",
-            kind,
-            "callbacks that look at training: what changes it belongs to the stage",
-            "Use finetune.keep_best=true." if isinstance(callback, BestWeights) else f"Use {stage}.schedules.",
-        )
+        allowed = "callbacks that look at training: what changes it belongs to the stage"
+        remedy = "Use finetune.keep_best=true." if isinstance(callback, BestWeights) else f"Use {stage}.schedules."
+        looks = not isinstance(callback, BestWeights | Schedules)
+        require(looks, f"callbacks.{stage}", kind, allowed, remedy)
     if any(isinstance(callback, ProgressBar) and type(callback) is not StageProgressBar for callback in callbacks):
         # A trainer has one bar: the one that somebody chose takes the place of ours.
         callbacks = [callback for callback in callbacks if type(callback) is not StageProgressBar]
@@ -282,9 +265,8 @@ _DTYPES = {
 def _loaded(source: ImageSource) -> ImageData:
     require_parts("data.source", source, "source of images", ("load",))
     images = _load(source) if isinstance(source, Hashable) else source.load()
-    require(
-        isinstance(images, ImageData), "data.source", type(images).__name__, "a load() that returns an ImageData"
-    )
+    is_data, kind = isinstance(images, ImageData), type(images).__name__
+    require(is_data, "data.source", kind, "a load() that returns an ImageData")
     return images
 
 

@@ -24,6 +24,7 @@ from memcomp_lightning.studies.plan import Plan, Stage
 
 _BY_THE_STAGE = "nothing, each stage sets it"
 _PASSES = "Use pretrain.iterations and finetune.iterations."
+_SUMMARY = "Add ModelSummary of lightning.pytorch.callbacks to callbacks.pretrain or callbacks.finetune."
 _NOT_HERE: dict[str, tuple[tuple[Any, ...], str, str]] = {
     "max_epochs": ((), _BY_THE_STAGE, _PASSES),
     "max_steps": ((-1,), _BY_THE_STAGE, _PASSES),
@@ -31,11 +32,7 @@ _NOT_HERE: dict[str, tuple[tuple[Any, ...], str, str]] = {
     "callbacks": ((), _BY_THE_STAGE, "Use callbacks.pretrain and callbacks.finetune."),
     "logger": ((), _BY_THE_STAGE, "Use the group logger, as in logger=csv."),
     "default_root_dir": ((), _BY_THE_STAGE, "Use hydra.run.dir."),
-    "enable_model_summary": (
-        (),
-        _BY_THE_STAGE,
-        "Add ModelSummary of lightning.pytorch.callbacks to callbacks.pretrain or callbacks.finetune.",
-    ),
+    "enable_model_summary": ((), _BY_THE_STAGE, _SUMMARY),
     "num_sanity_val_steps": ((), _BY_THE_STAGE, ""),
     "use_distributed_sampler": ((), _BY_THE_STAGE, "The data are dealt to the processes already."),
     "plugins": ((), _BY_THE_STAGE, "Use trainer.precision and trainer.strategy."),
@@ -88,13 +85,8 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
         remedy = "Use trainer.check_val_every_n_epoch, or null for it to count batches over passes."
         require(within or trainer.limit_val_batches == 0, "trainer.val_check_interval", every, allowed, remedy)
         judges = any(isinstance(callback, BestWeights) for callback in stage.callbacks)
-        allowed = "1.0 where finetune.keep_best is true"
-        require(
-            not judges or trainer.limit_val_batches == 1.0 or tries(trainer),
-            "trainer.limit_val_batches",
-            trainer.limit_val_batches,
-            allowed,
-        )
+        share, allowed = trainer.limit_val_batches, "1.0 where finetune.keep_best is true"
+        require(not judges or share == 1.0 or tries(trainer), "trainer.limit_val_batches", share, allowed)
 
 
 def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
@@ -106,13 +98,10 @@ def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: lis
     path = folder.checkpoint(stage.module.stage)
     settings = _settings(config.trainer)
     bars = [type(callback).__name__ for callback in stage.callbacks if isinstance(callback, ProgressBar)]
-    require(
-        not bars or settings.get("enable_progress_bar") in (None, True),
-        "trainer.enable_progress_bar",
-        settings.get("enable_progress_bar"),
-        f"true where there is a {'/'.join(bars)} among the callbacks",
-        "Leave it out: callbacks.pretrain.progress=null callbacks.finetune.progress=null.",
-    )
+    shows = settings.get("enable_progress_bar")
+    allowed = f"true where there is a {'/'.join(bars)} among the callbacks"
+    remedy = "Leave it out: callbacks.pretrain.progress=null callbacks.finetune.progress=null."
+    require(not bars or shows in (None, True), "trainer.enable_progress_bar", shows, allowed, remedy)
     if settings.get("profiler") in ("simple", "advanced"):
         # Lightning's own report of these goes to a log that is not shown.
         kind = f"lightning.pytorch.profilers.{settings['profiler'].capitalize()}Profiler"

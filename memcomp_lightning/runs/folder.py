@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.files import write_text
+from memcomp_lightning.files import write_json, write_text
 from memcomp_lightning.runs.paths import is_path
 
 
@@ -76,7 +76,7 @@ class RunFolder:
             if settings.exists():
                 self._check_same(settings, config)
             else:
-                self._write("overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
+                write_json(self.path / "overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
                 write_text(settings, OmegaConf.to_yaml(config))
         except OSError as error:
             raise UserError(
@@ -93,7 +93,7 @@ class RunFolder:
         now = {"memcomp_lightning": __version__, "source": _source(), **_machine()}
         there = self._read("origin.json")
         if there is None:
-            self._write("origin.json", now)
+            write_json(self.path / "origin.json", now)
         elif there["source"] != now["source"]:
             raise UserError(
                 f"run folder {self.path} was made by version {there['memcomp_lightning']}, source "
@@ -103,19 +103,19 @@ class RunFolder:
 
     def finish_stage(self, stage: str, record: dict[str, Any]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
-        self._write("stages.json", {**self.finished_stages, stage: record})
+        write_json(self.path / "stages.json", {**self.finished_stages, stage: record})
         self.checkpoint(stage).unlink(missing_ok=True)
 
     def finish(self, result: dict[str, Any]) -> None:
         """Write the result, with what produced it."""
         origin = {"memcomp_lightning": __version__, **_machine()}
-        self._write("result.json", {**result, "origin": origin})
+        write_json(self.path / "result.json", {**result, "origin": origin})
         self.forget_error()
 
     def fail(self, record: dict[str, Any]) -> None:
         """Write why the run failed."""
         self.path.mkdir(parents=True, exist_ok=True)
-        self._write("error.json", record)
+        write_json(self.path / "error.json", record)
 
     def forget_error(self) -> None:
         """Note that the last attempt did not fail."""
@@ -138,18 +138,14 @@ class RunFolder:
         return paths and self.typed_in / there == Path.cwd() / now
 
     def _read(self, name: str) -> dict[str, Any] | None:
+        path = self.path / name
         try:
-            content: dict[str, Any] = json.loads((self.path / name).read_text(encoding="utf-8"))
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
-            raise UserError(
-                f"{self.path / name} is damaged ({error}): restore it, or choose another folder."
-            ) from None
+            raise UserError(f"{path} is damaged ({error}): restore it, or choose another folder.") from None
         return content
-
-    def _write(self, name: str, content: dict[str, Any]) -> None:
-        write_text(self.path / name, json.dumps(content, indent=1) + "\n")
 
 
 def _machine() -> dict[str, str]:
@@ -170,11 +166,8 @@ def _source() -> str:
 
 
 _FREE_TO_CHANGE = (
-    "logger.",
-    "checkpoint_every",
-    "data.source.data_dir",
-    "data.source.download",
-    "figure.workers",
+    *("logger.", "checkpoint_every", "figure.workers"),
+    *("data.source.data_dir", "data.source.download"),
 )
 """Settings that do not change what is computed."""
 

@@ -19,11 +19,8 @@ from memcomp_lightning.runs.table import (
 def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, Any]]], path: Path) -> str:
     """A row for each setting, for the screen; the same as CSV in a file.
 
-    Mean and standard error are over seeds and replicas. Settings that all runs share are left out.
-
-    Args:
-        groups: Results of runs, by their settings but the seed.
-        path: Of the CSV.
+    Mean and standard error are over seeds and replicas. Settings that all runs share are left out. Results are
+    grouped by all settings but the seed.
     """
     settings = [dict(key) for key in groups]
     names = list(dict.fromkeys(name for setting in settings for name in setting))

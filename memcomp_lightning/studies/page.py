@@ -22,15 +22,7 @@ _HEADER = ("claim", "measured", "difference", "verdict", "controls that explain 
 
 
 class Section(NamedTuple):
-    """One figure.
-
-    Attributes:
-        title: Above it.
-        pictures: Caption and PNG of each.
-        verdicts: Rows of the table.
-        notes: Lines below: settings, time, where the numbers are.
-        rule: How verdicts are made.
-    """
+    """One study: captions with their PNGs, rows of its table, lines below these, and how verdicts are made."""
 
     title: str
     pictures: Sequence[tuple[str, bytes]]

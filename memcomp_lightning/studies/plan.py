@@ -17,13 +17,7 @@ from memcomp_lightning.training import Batches, Pass, PretrainingStage, pretrain
 
 @dataclass(frozen=True)
 class Stage:
-    """One fit.
-
-    Attributes:
-        module: What is trained.
-        data: Its images.
-        callbacks: What looks at it under a trainer.
-    """
+    """One fit: what is trained, its images, and what looks at it under a trainer."""
 
     module: StageModule
     data: ImageDataModule

@@ -76,11 +76,7 @@ def best(records: Iterable[Record]) -> Record | None:
 
 
 class Records:
-    """The records of a folder, each a line of a file, appended as soon as it exists.
-
-    Args:
-        folder: Of a run.
-        file: Its name; the file need not exist.
+    """The records of a folder, each a line of a file, appended as soon as it exists; there may be no file yet.
 
     Raises:
         SettingError: A line of the file is damaged; an unfinished last line is dropped.
