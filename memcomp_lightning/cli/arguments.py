@@ -25,12 +25,6 @@ from memcomp_lightning.runs.paths import is_path
 SHOWING = ("help", "hydra_help", "cfg", "info", "shell_completion")
 """Flags that show something and run nothing; the settings are checked all the same."""
 
-RUNNING = ("run", "multirun", "overrides")
-"""Flags of runs."""
-
-OF_CONFIGURATION = ("config_dir", "package", "resolve")
-"""Flags that say which configuration is meant, or what of it is shown."""
-
 REFUSED = {
     "config_name": "The configuration has one name. Put settings of your own in a file experiment/NAME.yaml of a "
     "folder, and choose it with --config-dir FOLDER experiment=NAME.",
@@ -38,9 +32,6 @@ REFUSED = {
     "experimental_rerun": "A run of memcomp-train is repeated, or goes on, with resume=FOLDER.",
 }
 """Flags that would leave the checks behind, and what to do instead."""
-
-BY_ENTRY = ("version",)
-"""Flags that are answered before Hydra is imported."""
 
 _NEVER_SWEPT = ("hydra.run.dir", "hydra.sweep.dir", "resume")
 _SEARCH_PATH = "hydra.searchpath"

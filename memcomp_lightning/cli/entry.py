@@ -16,12 +16,7 @@ LOST_OUTPUT = 1
 
 
 def run(command: str, *arguments: object) -> None:
-    """Run ``memcomp-NAME``: the ``main`` of ``memcomp_lightning.cli.commands.NAME``.
-
-    Args:
-        command: Its name.
-        arguments: Of its main.
-    """
+    """Run ``memcomp-NAME``: the ``main`` of ``memcomp_lightning.cli.commands.NAME``."""
     before = _end_at_once_on_interrupt(command)
     try:
         _run(command, arguments, before)

@@ -27,8 +27,6 @@ from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.paths import is_path
 
-_SEARCHES = ("hparams=", "hydra/sweeper=")
-
 LONGEST_NAME = 150
 """Characters of a job's folder; file systems allow 255."""
 
@@ -90,12 +88,12 @@ def check_command_line(
         try:
             _check_options(overrides, config_name, paths)
             jobs, searches = [overrides], False
-            if not line.multirun and any(o.startswith(_SEARCHES) and o != "hparams=null" for o in overrides):
-                raise UserError("a search is a multirun: add -m.")
             if line.multirun:
                 jobs, searches, folder = planned_jobs(overrides, config_name=config_name)
                 if searches and check_searchable is None:
                     raise UserError("this command returns nothing that a search could go by; memcomp-train does.")
+            elif any(o.startswith(("hparams=", "hydra/sweeper=")) and o != "hparams=null" for o in overrides):
+                raise UserError("a search is a multirun: add -m.")
         except CONFIGURATION_ERRORS as error:
             raise UserError(explain(error)) from error
         for job in jobs:
@@ -149,11 +147,9 @@ def claimed(folder: Path) -> Path:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
             path = folder if number == 1 else folder.with_name(f"{folder.name}_{number}")
-            try:
+            with suppress(FileExistsError):
                 path.mkdir()
-            except FileExistsError:
-                continue
-            return path
+                return path
     except OSError as error:
         raise UserError(f"folder {folder} cannot be made ({error.strerror}).") from error
     raise AssertionError

@@ -71,15 +71,9 @@ def in_words(error: BaseException) -> str:
 
 
 def check_exists(override: str, defaults: DictConfig, groups: Collection[str]) -> None:
-    """Raise if an override names a setting that does not exist.
+    """Raise if an override, ``pretrain.iteration=20``, names a setting that does not exist; say what is close.
 
-    Args:
-        override: As typed: ``pretrain.iteration=20``.
-        defaults: A composed configuration of the same groups.
-        groups: The groups; not all of them appear in the configuration.
-
-    Raises:
-        UserError: With what is close.
+    ``defaults`` is a composed configuration of the same groups, in which not all ``groups`` need to appear.
     """
     name, equals, _ = override.partition("=")
     if name[:1] in ("+", "~") or "@" in name or "/" in name or name.partition(".")[0] == "hydra":

@@ -25,7 +25,7 @@ from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
-from memcomp_lightning.modules.trainers import check_bare_loop, check_callback, precision_of
+from memcomp_lightning.modules.trainers import PRECISIONS, check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
@@ -195,7 +195,7 @@ def _network(config: DictConfig, images: ImageData) -> nn.Module:
         network: nn.Module = factory(**arguments)
     except TypeError as error:
         raise UserError(f"model: {error}") from error
-    network.to(_DTYPES[precision_of(config.trainer.precision)])
+    network.to(PRECISIONS[precision_of(config.trainer.precision)])
     if weights is not None:
         require(isinstance(weights, str), "model.weights", weights, "the path of a weight file, or null")
         load_weights(network, Path(weights))
@@ -217,7 +217,7 @@ def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
 
 
 def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
-    settings = {str(name): value for name, value in config.data.items() if name != "source"}
+    settings = {name: config.data[name] for name in _SETTINGS["data"] if name != "source"}
     try:
         return ImageDataModule(images, batch_size=config[stage].batch_size, seed=config.seed, **settings)
     except ValueError as error:
@@ -252,14 +252,6 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
         # A trainer has one bar: the one that somebody chose takes the place of ours.
         callbacks = [callback for callback in callbacks if type(callback) is not StageProgressBar]
     return callbacks
-
-
-_DTYPES = {
-    "32-true": torch.float32,
-    "64-true": torch.float64,
-    "16-true": torch.float16,
-    "bf16-true": torch.bfloat16,
-}
 
 
 def _loaded(source: ImageSource) -> ImageData:

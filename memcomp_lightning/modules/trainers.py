@@ -3,12 +3,18 @@
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch import callbacks
 from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
 
 from memcomp_lightning.errors import require
 
-PRECISIONS = ("32-true", "64-true", "16-true", "bf16-true")
+PRECISIONS = {
+    "32-true": torch.float32,
+    "64-true": torch.float64,
+    "16-true": torch.float16,
+    "bf16-true": torch.bfloat16,
+}
 """Each has one dtype for all that a stage computes."""
 
 _SPELLINGS = {"32": "32-true", "64": "64-true", "None": "32-true"}

@@ -38,17 +38,9 @@ def run(
 ) -> dict[str, Any]:
     """Train what is not trained yet, evaluate, and return the result.
 
-    Every stage that is done left its weights; an interrupted one goes on from its last checkpoint.
-
-    Args:
-        plan: Network and stages.
-        folder: Where everything is kept.
-        make_trainer: Makes the trainer of a stage.
-        loggers: Those of the trainers: they get the final numbers.
-        settings: What tells the run from others of a sweep, for TensorBoard.
-        overrides: What was typed, by name, for the result.
-        seed: Of the run.
-        choice: What held-out images chose before the run.
+    Every stage that is done left its weights; an interrupted one goes on from its last checkpoint. The loggers of
+    the trainers get the final numbers beside ``settings``, which tell the run from others of a sweep. The result
+    names what was typed, ``overrides``, and what held-out images chose before the run, ``choice``.
 
     Raises:
         UserError: A stage cannot be trained to its end so.

@@ -33,9 +33,7 @@ def with_error(values: Sequence[float], digits: int = 4) -> str:
 def aligned(rows: Sequence[Sequence[str]], *, most: int | None = None) -> str:
     """The rows as text in columns that are aligned to the right; the first row is the header.
 
-    Args:
-        rows: Of cells.
-        most: Characters of a line; a header that makes it longer has its words below each other.
+    A header that makes lines longer than ``most`` characters has its words below each other.
     """
     head, n = [[cell] for cell in rows[0]], len(rows[0])
     if most is not None and sum(max(len(row[c]) for row in rows) + 2 for c in range(n)) - 2 > most:

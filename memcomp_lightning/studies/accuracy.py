@@ -13,8 +13,7 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import stacked
-from memcomp_lightning.modules import Classifier
-from memcomp_lightning.studies.plan import Plan, Stage, Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.plan import Plan, Trial, finetuning_of, passes_without_trainer, pretraining_of
 from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError, evaluate, finetune
 from memcomp_lightning.types import Batch
@@ -46,12 +45,9 @@ class AccuracyTrial(Trial):
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Trials whose networks are fine-tuned as one tensor program.
+    """Trials of one :attr:`AccuracyTrial.fine_tuning`, whose networks are fine-tuned as one tensor program.
 
-    Attributes:
-        trials: What :attr:`AccuracyTrial.fine_tuning` says is the same for all.
-        passes: Fine-tuning passes after which they are tested.
-        n_updates: Network updates, of all replicas.
+    They are tested after ``passes`` of it; ``n_updates`` counts those of all replicas.
     """
 
     trials: tuple[AccuracyTrial, ...]
@@ -107,10 +103,9 @@ class SideBySide:
     ) -> tuple[list[float], dict[str, Tensor]]:
         """Seconds by pass; scores by name, ``(n_passes, n_trials, n_replicas)``."""
         begin = time.perf_counter()
-        stage = tuning(plans[0])
+        stage, first = finetuning_of(plans[0])
         n_trials, replicas = len(plans), stage.data.replicas
-        loss = _classifier(plans[0]).loss
-        network = stacked([_classifier(plan).network for plan in plans], replicas).to(device)
+        network = stacked([finetuning_of(plan)[1].network for plan in plans], replicas).to(device)
         batches = stage.data.train_batches(0, 1).repeated([trial.seed for trial in trials]).to(device)
         tests = {"test": stage.data.test, "validation": stage.data.validation}
         images = {name: _side_by_side(*held, n_trials, replicas, device) for name, held in tests.items() if held}
@@ -124,16 +119,16 @@ class SideBySide:
                 network,
                 batches,
                 iterations=self.passes[-1],
-                optimizer=stage.module.make_optimizer,
-                schedules=stage.module.schedules,
-                loss=loss,
+                optimizer=first.make_optimizer,
+                schedules=first.schedules,
+                loss=first.loss,
                 keep_best_by=images["validation"] if keeps_best else None,
             ):
                 progress(f"{self.title}, pass {done} of {self.passes[-1]}", n_updates)
                 if done in self.passes:
                     seconds.append(time.perf_counter() - begin)
                     for name, batch in images.items():
-                        score = evaluate(network, [batch], loss)
+                        score = evaluate(network, [batch], first.loss)
                         scores[f"{name}_accuracy"].append(score.accuracy)
                         scores[f"{name}_loss"].append(score.mean_loss)
         except DivergedError:
@@ -161,7 +156,7 @@ def grouped(
         groups[trial.fine_tuning].append(trial)
     programs = []
     for alike in groups.values():
-        data = tuning(plan_of(alike[0], passes[-1])).data
+        data = finetuning_of(plan_of(alike[0], passes[-1]))[0].data
         n_replicas = math.prod(data.replicas)
         on_cpu = device_of(alike[0].settings["trainer"]["accelerator"]).type == "cpu"
         at_once = networks if networks is not None else _IN_CACHE if on_cpu else _ON_GPU
@@ -195,18 +190,6 @@ def pretrained(plan: Plan, seed: int, device: torch.device) -> Plan:
             pass
     plan.change_between_stages(seed)
     return plan
-
-
-def tuning(plan: Plan) -> Stage:
-    """The last stage, which every network of a figure has."""
-    assert plan.finetuning is not None
-    return plan.finetuning
-
-
-def _classifier(plan: Plan) -> Classifier:
-    module = tuning(plan).module
-    assert isinstance(module, Classifier)
-    return module
 
 
 def _side_by_side(

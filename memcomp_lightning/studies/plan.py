@@ -10,7 +10,7 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.data import ImageDataModule
 from memcomp_lightning.models import DBN, Randomiser
-from memcomp_lightning.modules import EnergyPretraining, StageModule
+from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule
 from memcomp_lightning.studies.records import Named
 from memcomp_lightning.training import Batches, Pass, PretrainingStage, pretrain
 
@@ -95,4 +95,12 @@ def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
     stage = plan.pretraining
     assert stage is not None
     assert isinstance(stage.module, EnergyPretraining)
+    return stage, stage.module
+
+
+def finetuning_of(plan: Plan) -> tuple[Stage, Classifier]:
+    """The last stage of a plan that fine-tunes, and its module."""
+    stage = plan.finetuning
+    assert stage is not None
+    assert isinstance(stage.module, Classifier)
     return stage, stage.module

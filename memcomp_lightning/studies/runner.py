@@ -45,12 +45,9 @@ Do = Callable[[Sequence[Work]], Iterator[list[Record]]]
 
 @contextmanager
 def runner(name: str, *, workers: int | None = 1, accelerator: str = "cpu") -> Iterator[Run]:
-    """Yield a function that trains the trials of a study, in this process or in several others.
+    """Yield a function that trains the trials of a study, here or in several processes of one thread.
 
-    Args:
-        name: Of the study, for the progress bar.
-        workers: Processes, each on one thread; None is one for each core, one in all with a GPU.
-        accelerator: The trainer's setting.
+    ``workers`` None is one for each core, one in all where the trainer's setting of the accelerator is a GPU.
     """
     if workers is None:
         workers = 1 if device_of(accelerator).type != "cpu" else _n_cores()

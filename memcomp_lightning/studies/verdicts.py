@@ -19,15 +19,7 @@ RULE = (
 
 
 class Verdict(NamedTuple):
-    """One row of the table.
-
-    Attributes:
-        claim: The paper's, in one sentence.
-        measured: Numbers.
-        test: Paired difference, interval, p value.
-        verdict: Holds, does not hold, or holds only without some controls.
-        explained_by: These controls.
-    """
+    """One row of the table: a claim, numbers, the test of their difference, and controls that explain it."""
 
     claim: str
     measured: str

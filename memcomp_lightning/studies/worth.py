@@ -100,14 +100,9 @@ class Comparison:
 
 
 class End(NamedTuple):
-    """A method at its best learning rate after its last update: nats, less is better.
+    """A method at its best learning rate after its last update: nats of the reported replicas, less is better.
 
-    Attributes:
-        rate: The learning rate.
-        median: Over the reported replicas.
-        worst: Of them.
-        reverse: Median by reverse AIS; None where it is not estimated.
-        seconds: Of training, all replicas.
+    ``reverse`` is the median by reverse AIS, None where it is not estimated; seconds are those of all replicas.
     """
 
     rate: float
