@@ -147,11 +147,7 @@ def from_folder(override: str, folder: Path) -> str:
 
 
 def parse(override: str) -> Override:
-    """An override, parsed.
-
-    Raises:
-        UserError: Naming it, and how to write it.
-    """
+    """An override, parsed; where that is not possible, a UserError says how to write it."""
     try:
         return OverridesParser.create().parse_override(override)
     except HydraException:
@@ -249,11 +245,7 @@ def _value(text: str) -> object:
 
 
 def expanded(name: str, text: str) -> str:
-    """A path as typed, but for a ~ that is somebody's folder.
-
-    Raises:
-        UserError: There is no such user.
-    """
+    """A path as typed, but for a ~ that is somebody's folder; a UserError where there is no such user."""
     path = Path(text)
     try:
         return text if not text.startswith("~") or path.exists() else str(path.expanduser())

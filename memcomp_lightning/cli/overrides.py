@@ -122,11 +122,7 @@ def check_command_line(
 
 @contextmanager
 def answering(line: CommandLine) -> Iterator[None]:
-    """Turn what Hydra raises on a checked command line into one line, and take an unused folder away again.
-
-    Raises:
-        UserError: In place of Hydra's own errors.
-    """
+    """Turn what Hydra raises on a checked command line into a UserError; take an unused folder away again."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:

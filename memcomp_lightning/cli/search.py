@@ -51,11 +51,7 @@ def named_by_time(settings: DictConfig) -> str | None:
 
 
 def check_searchable(config: DictConfig) -> None:
-    """Refuse a job that returns nothing to search by.
-
-    Raises:
-        SettingError: Naming the setting.
-    """
+    """Refuse a job that returns nothing to search by."""
     is_one = config.figure is None and config.worth is None
     require(is_one, "experiment", "one of many runs", "one run in a search")
     require_held_out(config, "in a search", "settings")

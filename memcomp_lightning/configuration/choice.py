@@ -19,11 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def tried_values(config: DictConfig) -> list[float]:
-    """The values that are tried, none if nothing is chosen.
-
-    Raises:
-        SettingError: The setting does not exist, or there is no value to try.
-    """
+    """The values that are tried, none if nothing is chosen; refuses no value, and a setting that does not exist."""
     if config.choose is None:
         return []
     allowed = "{setting: NAME, values: [...]}, or null"
@@ -38,11 +34,7 @@ def tried_values(config: DictConfig) -> list[float]:
 
 
 def with_choice(config: DictConfig, value: float) -> DictConfig:
-    """A copy in which the setting has this value and nothing is left to choose.
-
-    Raises:
-        UserError: The setting does not exist.
-    """
+    """A copy in which the setting, which must exist, has this value and nothing is left to choose."""
     chosen, setting = copy.deepcopy(config), config.choose.get("setting")
     try:
         OmegaConf.update(chosen, str(setting), value)

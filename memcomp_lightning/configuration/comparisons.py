@@ -25,11 +25,7 @@ _SET_BY_COMPARISON = {
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Build one replica of every method on every data set, and train nothing.
-
-    Raises:
-        UserError, SettingError, InstantiationException: As ``build``.
-    """
+    """Build one replica of every method on every data set, and train nothing; raises as ``build``."""
     if config.figure is not None:
         raise UserError(
             "preset=quick is one of figures: make the comparison smaller with worth.only=[DATA_SET], "

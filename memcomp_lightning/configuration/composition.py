@@ -23,8 +23,7 @@ _OF_MANY_RUNS = ("hydra.", "figure.", "figure/", "worth.", "worth/")
 
 def composing() -> AbstractContextManager[None]:
     """The context in which :func:`composed_for` and Hydra's ``compose`` find our groups, outside of a command."""
-    context: AbstractContextManager[None] = initialize_config_module(CONFIG_MODULE, **INITIALIZE)
-    return context
+    return initialize_config_module(CONFIG_MODULE, **INITIALIZE)
 
 
 def search_paths(overrides: Iterable[str]) -> list[str]:

@@ -77,11 +77,7 @@ def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Build the networks of every curve, and train nothing.
-
-    Raises:
-        UserError, SettingError, InstantiationException: As ``build``.
-    """
+    """Build the networks of every curve, and train nothing; raises as ``build``."""
     check_not_given(overrides, {**_SET_BY_FIGURE, "sampler": _SET_BY_CURVES}, "a figure")
     _, composed, _ = _read(config, overrides)
     for name, settings in composed.items():

@@ -143,11 +143,7 @@ def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
 
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:
-    """Refuse callbacks and limits that change training: a loop without a trainer would leave them out.
-
-    Raises:
-        SettingError: Naming the callback or the setting.
-    """
+    """Refuse callbacks and limits that change training: a loop without a trainer would leave them out."""
     for stage in plan.stages:
         for callback in stage.callbacks:
             check_bare_loop(callback, f"callbacks.{stage.module.stage}")

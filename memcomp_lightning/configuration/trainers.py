@@ -61,11 +61,7 @@ _NOT_HERE: dict[str, tuple[tuple[Any, ...], str, str]] = {
 
 
 def check_trainers(plan: Plan, config: DictConfig) -> None:
-    """Make the trainer of each stage, and train nothing.
-
-    Raises:
-        UserError: A setting or callback of the trainer cannot be used, alone or together with others.
-    """
+    """Make the trainer of each stage; refuse settings and callbacks that cannot be used, alone or together."""
     folder = RunFolder(Path())
     loggers: list[Logger] = [DummyLogger() for logger in config.logger.values() if logger is not None]
     for stage in plan.stages:

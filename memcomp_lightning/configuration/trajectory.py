@@ -17,11 +17,7 @@ from memcomp_lightning.studies.trajectory import draw_trajectory
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> tuple[Plan, DmmSolver]:
-    """Build the network and the machine.
-
-    Raises:
-        SettingError: The solver is not the DMM, or nothing is pretrained.
-    """
+    """Build the network and the machine; refuses another solver than the DMM, and a run without pretraining."""
     composed = composed_for(overrides)
     plan, solver = build(composed), instantiate(composed.solver)
     if not isinstance(plan.network, DBN) or plan.pretraining is None:

@@ -65,11 +65,7 @@ class RunFolder:
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
-        """Make the folder, or check that it belongs to the same settings.
-
-        Raises:
-            UserError: The folder cannot be written, or was made with other settings.
-        """
+        """Make the folder; a UserError if it cannot be written, or was made with other settings."""
         settings = self.path / "settings.yaml"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -85,11 +81,7 @@ class RunFolder:
             ) from error
 
     def check_source(self) -> None:
-        """Note which code makes the results of this folder, or check that it is the same.
-
-        Raises:
-            UserError: Other code made what is there.
-        """
+        """Note which code makes the results of this folder; a UserError if other code made what is there."""
         now = {"memcomp_lightning": __version__, "source": _source(), **_machine()}
         there = self._read("origin.json")
         if there is None:

@@ -25,22 +25,23 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
     settings = [dict(key) for key in groups]
     names = list(dict.fromkeys(name for setting in settings for name in setting))
     swept = [name for name in names if len({setting.get(name) for setting in settings}) > 1]
-    screen = [[*swept, "runs x replicas", *(measure.title for measure in _MEASURES), "wall time"]]
-    numbers = [f"{measure.name}_{what}" for measure in _MEASURES for what in ("mean", "error")]
-    sheet: list[list[Any]] = [[*swept, "n_runs", "n_values", *numbers, "wall_time_s"]]
+    held_out = any(result.get("validation_accuracy") for results in groups.values() for result in results)
+    measures = [measure for measure in _MEASURES if held_out or measure.name != "validation_accuracy"]
+    screen = [[*swept, "runs x replicas", *(measure.title for measure in measures), "wall time"]]
+    numbers = [f"{measure.name}_{what}" for measure in measures for what in ("mean", "error")]
+    sheet: list[list[object]] = [[*swept, "n_runs", "n_values", *numbers, "wall_time_s"]]
     for setting, results in sorted(
         zip(settings, groups.values(), strict=True), key=lambda pair: _order(pair[0], swept)
     ):
-        found = {m.name: [x for result in results for x in m.of(result)] for m in _MEASURES}
+        found = {m.name: [x for result in results for x in m.of(result)] for m in measures}
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
         own, mean_s = [setting.get(name, "") for name in swept], sum(seconds) / len(seconds)
         n_values = max(len(found["energy_gap"]), len(found["test_accuracy"]))
-        cells = [with_error(found[m.name], digits=m.digits) if found[m.name] else "" for m in _MEASURES]
+        cells = [with_error(found[m.name], digits=m.digits) if found[m.name] else "" for m in measures]
         screen.append([*own, f"{len(results)} x {n_values // len(results)}", *cells, f"{mean_s:.1f} s"])
         pairs = [mean_and_error(values) if values else ("", "") for values in found.values()]
         sheet.append([*own, len(results), n_values, *(x for pair in pairs for x in pair), mean_s])
-    shown = [column for column, title in enumerate(sheet[0]) if not _left_out(title, sheet, column)]
-    write_text(path, as_csv([row[column] for column in shown] for row in sheet))
+    write_text(path, as_csv(sheet))
     return aligned(without_empty_columns(screen), most=terminal_width())
 
 
@@ -68,11 +69,6 @@ _MEASURES = (
     _Measure("validation_accuracy", "held-out accuracy", lambda result: result.get("validation_accuracy", [])),
     _Measure("test_accuracy", "test accuracy", lambda result: result.get("test_accuracy", [])),
 )
-
-
-def _left_out(title: str, sheet: Sequence[Sequence[Any]], column: int) -> bool:
-    """Accuracies on held-out images have columns only where there are such images."""
-    return title.startswith("validation") and all(row[column] == "" for row in sheet[1:])
 
 
 def _order(setting: dict[str, str], names: list[str]) -> list[tuple[int, float, str]]:

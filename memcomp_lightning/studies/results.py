@@ -55,10 +55,8 @@ class FigurePlan:
     Attributes:
         name: "figure4" and so on; begins the names of its files.
         title: What was trained.
-        data: Name of the data set.
         against: Axis of the curves, "iterations" or "passes".
         passes: Fine-tuning passes after which the networks were tested.
-        claims: Pairs of curves that the paper compares.
         labels: Names for people, by curve, in the order of the legend.
         chosen: The setting that is chosen on held-out images, by curve.
         stop_early: Curves that report the pass of best validation accuracy.
@@ -174,11 +172,7 @@ def at_best_validation(record: Record) -> NDArray[np.float64]:
 
 
 def read_results(folder: Path) -> Results:
-    """Read the folder of a run of a figure.
-
-    Raises:
-        FileNotFoundError: It holds no figure.
-    """
+    """Read the folder of a run of a figure; a FileNotFoundError if it holds none."""
     path = folder / "figure.json"
     if not path.exists():
         raise FileNotFoundError(

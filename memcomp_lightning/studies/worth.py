@@ -232,11 +232,7 @@ def worth_table(worth: Worth) -> list[list[str]]:
 
 
 def read_worth(folder: Path) -> Worth:
-    """Read the folder of a run of ``experiment=sampler_worth``.
-
-    Raises:
-        FileNotFoundError: It holds none.
-    """
+    """Read the folder of a run of ``experiment=sampler_worth``; a FileNotFoundError if it holds none."""
     path = folder / "worth.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no worth.json: name the folder of experiment=sampler_worth.")
