@@ -7,7 +7,7 @@ import re
 import shlex
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NoReturn
@@ -72,10 +72,6 @@ class CommandLine:
         texts = [text for key, _, text in (o.partition("=") for o in self.overrides) if key == name]
         return unquoted(texts[-1]) if texts else None
 
-    def writing_to(self, folder: Path, name: str) -> "CommandLine":
-        """The same with a folder of its own as the setting of this name."""
-        return replace(self, overrides=(*self.overrides, with_path(name, folder)), claimed=folder)
-
 
 def read(arguments: Sequence[str]) -> CommandLine:
     """Read a command line.
@@ -124,15 +120,6 @@ def unquoted(text: str) -> str:
     """A value as Hydra reads it, where that is a text; else as it stands."""
     value = _value(text)
     return value if isinstance(value, str) else text
-
-
-def as_typed(command: str, *arguments: object) -> str:
-    """A command as it is typed in a shell.
-
-    >>> as_typed("memcomp-train", "resume=my runs/a")
-    "memcomp-train 'resume=my runs/a'"
-    """
-    return shlex.join([command, *map(str, arguments)])
 
 
 def from_folder(override: str, folder: Path) -> str:

@@ -58,8 +58,11 @@ def make_tolerant() -> list[OSError]:
             _occupy(number)
             setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
         elif type(stream) is io.TextIOWrapper:  # no others, such as a notebook's
-            setattr(sys, name, _tolerant(stream, failures if number == 1 else []))
-            _hand_over(stream, getattr(sys, name))
+            tolerant = _tolerant(stream, failures if number == 1 else [])
+            setattr(sys, name, tolerant)
+            for handler in logging.getLogger().handlers:  # those that were made before
+                if isinstance(handler, logging.StreamHandler) and handler.stream is stream:
+                    handler.setStream(tolerant)
     return failures
 
 
@@ -106,13 +109,6 @@ def _tolerant(stream: io.TextIOWrapper, failures: list[OSError]) -> io.TextIOWra
         line_buffering=stream.line_buffering,
         write_through=stream.write_through,
     )
-
-
-def _hand_over(stream: io.TextIOWrapper, tolerant: io.TextIOWrapper) -> None:
-    """Let log handlers that were made before write to the new stream."""
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.StreamHandler) and handler.stream is stream:
-            handler.setStream(tolerant)
 
 
 def _occupy(number: int) -> None:

@@ -7,6 +7,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.arguments import CommandLine, parse
+from memcomp_lightning.cli.arguments import CommandLine, parse, with_path
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.configuration.composition import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_exists, explain
@@ -58,16 +59,12 @@ def check_command_line(
 
     With a flag that shows something, such as --help, the settings are checked, and nothing is built.
 
-    Args:
-        line: As typed.
-        config_name: The configuration that the overrides are for.
-        check: Builds what a job needs, from its configuration and overrides, or raises one of
-            ``CONFIGURATION_ERRORS``.
-        folders: Where a run and a sweep write, unless the arguments say it.
-        check_searchable: Raises if a job returns nothing that a search could go by; None if none does.
+    ``check`` builds what a job needs, from its configuration and overrides, or raises one of
+    ``CONFIGURATION_ERRORS``; ``check_searchable`` raises if a job returns nothing that a search could go by, and
+    is None if none does. A run and a sweep write into ``folders``, unless the arguments say it.
 
     Returns:
-        The same with a folder that is this command's alone: where the settings name it by the time, it is made
+        The line with a folder that is this command's alone: where the settings name it by the time, it is made
         here, and a second command of the same second gets another.
 
     Raises:
@@ -117,7 +114,8 @@ def check_command_line(
                 raise UserError((message or _naming_override(explain(error), job)) + where) from error
     if line.shows or line.value(key) is not None or folder is None:
         return line
-    return line.writing_to(claimed(Path(folder)), key)
+    path = claimed(Path(folder))
+    return replace(line, overrides=(*line.overrides, with_path(key, path)), claimed=path)
 
 
 @contextmanager

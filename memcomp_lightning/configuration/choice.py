@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def tried_values(config: DictConfig) -> list[float]:
-    """The values that are tried, none if nothing is chosen; refuses no value, and a setting that does not exist."""
+    """The values that are tried, none if nothing is chosen; refuses a setting that does not exist."""
     if config.choose is None:
         return []
     allowed = "{setting: NAME, values: [...]}, or null"

@@ -43,7 +43,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         require(data.replicas == (), "data.partitions", data.replicas, "1: replicas are seeds here")
         if (trial.data_set, trial.method) not in seen:
             seen.add((trial.data_set, trial.method))
-            measure = MEASURES[trial.measure]
+            measure = MEASURES[comparison.data_sets[trial.data_set].measure]
             score = measure.make(data, 1)
             if measure.is_exact:
                 score(joint_model(stacked([plan.network], ())))
@@ -77,14 +77,11 @@ def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> I
                     data_set=data_name,
                     method=method_name,
                     value=rate,
+                    comparison=comparison,
                     folder=str(folder),
                     settings=own,
                     build=plan_of,
-                    n_reported=comparison.n_reported(data_name),
-                    n_choosing=data_set.choosing or comparison.choosing,
                     points=_points(all_passes, data_set.points or comparison.points),
-                    measure=data_set.measure,
-                    gradient_draws=comparison.gradient_draws,
                     greedy_passes=greedy_passes,
                 )
 
@@ -92,8 +89,7 @@ def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> I
 def _schedule(composed: DictConfig, passes: int, method: Method) -> tuple[int, int, int]:
     """Share passes out to layers, so that methods of many layers and of one have about as many updates.
 
-    Returns:
-        Passes of a layer or of all layers together, of each layer before joint training, and all of them.
+    These are passes of a layer or of all layers together, of each layer before joint training, and in all.
     """
     n_phases, layers = len(pretraining_of(build(composed))[1].phases), len(composed.model.get("hidden_sizes", [0]))
     if n_phases > 1 or not method.greedy_start:

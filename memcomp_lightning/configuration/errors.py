@@ -102,7 +102,4 @@ def _nearest(name: str, known: Collection[str]) -> list[str]:
 
 def _full_key(*lines: str) -> str:
     """The setting that Hydra was building."""
-    for line in lines:
-        if line.startswith("full_key: "):
-            return line.removeprefix("full_key: ")
-    return ""
+    return next((line.removeprefix("full_key: ") for line in lines if line.startswith("full_key: ")), "")

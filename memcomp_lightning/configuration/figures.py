@@ -1,7 +1,7 @@
 """A figure of the paper: its curves as trials, a record for each as soon as it exists."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -68,12 +68,8 @@ def train(config: DictConfig, overrides: Sequence[str], folder: Path) -> None:
     write_json(folder / "figure.json", asdict(plan))
     with runner(figure.name, workers=figure.workers, accelerator=config.trainer.accelerator) as run:
         for choosing in (True, False):
-            trials = [
-                trial
-                for name, settings in composed.items()
-                for trial in _trials(figure, name, settings, records, choosing=choosing)
-            ]
-            run(grouped(trials, tuple(sorted(figure.passes)), networks=figure.networks), records)
+            trials = list(_trials(figure, composed, records, choosing=choosing))
+            run(grouped(trials, tuple(plan.passes), networks=figure.networks), records)
 
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -127,17 +123,18 @@ def _read(config: DictConfig, overrides: Sequence[str]) -> tuple[Figure, dict[st
 
 
 def _trials(
-    figure: Figure, name: str, composed: DictConfig, records: Records, *, choosing: bool
+    figure: Figure, composed: Mapping[str, DictConfig], records: Records, *, choosing: bool
 ) -> Iterator[AccuracyTrial]:
-    """The networks of a curve, or those for its choice, that have no record."""
-    iterations, seeds = figure.curves[name].iterations or figure.iterations, figure.seeds
-    values: Sequence[float | None] = tried_values(composed)
-    if choosing:
-        iterations, seeds = iterations[-1:], seeds[:1]
-    else:
-        values = [records.best_value(name)]  # None where nothing is chosen
+    """The networks of all curves, or those for their choices, that have no record."""
     done = records.keys
-    for value in values:
-        first = trial_of(composed, name, value=value, choosing=choosing)
-        trials = (replace(first, iterations=n, seed=seed) for n in iterations for seed in seeds)
-        yield from (trial for trial in trials if trial.key not in done)
+    for name, settings in composed.items():
+        iterations, seeds = figure.curves[name].iterations or figure.iterations, figure.seeds
+        values: Sequence[float | None] = tried_values(settings)
+        if choosing:
+            iterations, seeds = iterations[-1:], seeds[:1]
+        else:
+            values = [records.best_value(name)]  # None where nothing is chosen
+        for value in values:
+            first = trial_of(settings, name, value=value, choosing=choosing)
+            trials = (replace(first, iterations=n, seed=seed) for n in iterations for seed in seeds)
+            yield from (trial for trial in trials if trial.key not in done)

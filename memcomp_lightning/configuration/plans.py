@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache, partial
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,10 @@ from memcomp_lightning.training import OptimizerFactory, Schedule
 from memcomp_lightning.training.schedules import check_schedules
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
-_GROUPS = (
-    *("data", "model", "solver", "sampler", "positive"),
-    *("pretrain", "finetune", "trainer", "logger", "callbacks"),
-)
+_OF_MODELS = ("data", "model", "solver", "sampler", "positive")
+_OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
 _SETTINGS = {
-    "": (*_GROUPS, "seed", "checkpoint_every", "between_stages", "choose", "tried", "figure", "worth"),
+    "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
     "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "stage"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best"),
@@ -252,13 +251,11 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
 
 def _loaded(source: ImageSource) -> ImageData:
     require_parts("data.source", source, "source of images", ("load",))
-    images = _load(source) if isinstance(source, Hashable) else source.load()
+    images = _load_once(source) if isinstance(source, Hashable) else source.load()
     is_data, kind = isinstance(images, ImageData), type(images).__name__
     require(is_data, "data.source", kind, "a load() that returns an ImageData")
     return images
 
 
-@lru_cache(maxsize=1)
-def _load(source: ImageSource) -> ImageData:
-    """Load a data set once for the jobs of a sweep; sources are frozen, hence hashable."""
-    return source.load()
+_load_once = lru_cache(maxsize=1)(methodcaller("load"))
+"""For the jobs of a sweep; sources are frozen, hence hashable."""

@@ -1,7 +1,9 @@
 """The stages of one run, each picked up where it was left."""
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import lightning.pytorch as pl
@@ -9,6 +11,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
 
+from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
@@ -18,7 +21,6 @@ from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.table import final_log_likelihoods
-from memcomp_lightning.runs.threads import threads_for
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
 
@@ -54,7 +56,7 @@ def run(
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
         else:
-            with threads_for(stage):
+            with _threads_for(stage):
                 trainer = _fit(stage, make_trainer(stage), folder)
             keeps = trainer.is_global_zero and not tries(trainer)
             records[name] = _record(stage)
@@ -80,6 +82,21 @@ def run(
         _log_final(loggers, settings, result)
         folder.finish(result)
     return result
+
+
+WORTH_THREADS = 2**22
+"""Products of a unit and a weight in an update from which a second thread helps: about a millisecond."""
+
+
+def _threads_for(stage: Stage) -> AbstractContextManager[None]:
+    """Compute small updates in one thread, as fast as in several.
+
+    More threads would wait for work by spinning, which makes two runs side by side ten times slower. If
+    ``OMP_NUM_THREADS`` is set, nothing is changed.
+    """
+    n_products = stage.data.n_at_once * max(parameter.numel() for parameter in stage.module.parameters())
+    alone = "OMP_NUM_THREADS" not in os.environ and n_products < WORTH_THREADS
+    return in_one_thread() if alone else nullcontext()
 
 
 def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:

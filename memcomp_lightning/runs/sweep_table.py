@@ -5,15 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from memcomp_lightning.files import as_csv, write_text
-from memcomp_lightning.runs.table import (
-    LIKELIHOOD_TITLE,
-    aligned,
-    final_log_likelihoods,
-    mean_and_error,
-    terminal_width,
-    with_error,
-    without_empty_columns,
-)
+from memcomp_lightning.runs import table
 
 
 def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, Any]]], path: Path) -> str:
@@ -37,12 +29,12 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
         own, mean_s = [setting.get(name, "") for name in swept], sum(seconds) / len(seconds)
         n_values = max(len(found["energy_gap"]), len(found["test_accuracy"]))
-        cells = [with_error(found[m.name], digits=m.digits) if found[m.name] else "" for m in measures]
+        cells = [table.with_error(found[m.name], digits=m.digits) if found[m.name] else "" for m in measures]
         screen.append([*own, f"{len(results)} x {n_values // len(results)}", *cells, f"{mean_s:.1f} s"])
-        pairs = [mean_and_error(values) if values else ("", "") for values in found.values()]
+        pairs = [table.mean_and_error(values) if values else ("", "") for values in found.values()]
         sheet.append([*own, len(results), n_values, *(x for pair in pairs for x in pair), mean_s])
     write_text(path, as_csv(sheet))
-    return aligned(without_empty_columns(screen), most=terminal_width())
+    return table.aligned(table.without_empty_columns(screen), most=table.terminal_width())
 
 
 class _Measure(NamedTuple):
@@ -62,8 +54,8 @@ _MEASURES = (
     ),
     _Measure(
         "log_likelihood",
-        f"{LIKELIHOOD_TITLE}, first layer",
-        lambda result: [x for layer in final_log_likelihoods(result)[:1] for x in layer],
+        f"{table.LIKELIHOOD_TITLE}, first layer",
+        lambda result: [x for layer in table.final_log_likelihoods(result)[:1] for x in layer],
         digits=2,
     ),
     _Measure("validation_accuracy", "held-out accuracy", lambda result: result.get("validation_accuracy", [])),

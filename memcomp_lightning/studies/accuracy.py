@@ -70,7 +70,7 @@ class SideBySide:
             DivergedError: Naming the curve.
         """
         device = device_of(self.trials[0].settings["trainer"]["accelerator"])
-        trials, plans, pretrain_s, found = [], [], [], []
+        trained, found = [], []
         for number, trial in enumerate(self.trials, start=1):
             progress(f"{self.title}, pretraining {number} of {len(self.trials)}", 0)
             begin = time.perf_counter()
@@ -81,12 +81,11 @@ class SideBySide:
                     raise DivergedError(f"figure.curves.{trial.method}: {error}") from error
                 nothing = {f"{name}_accuracy": [[0.0]] * len(self.passes) for name in ("test", "validation")}
                 found.append(trial.record(self.passes, [time.perf_counter() - begin] * len(self.passes), nothing))
-                continue
-            trials.append(trial)
-            plans.append(plan)
-            pretrain_s.append(time.perf_counter() - begin)
-        if not trials:
+            else:
+                trained.append((trial, plan, time.perf_counter() - begin))
+        if not trained:
             return found
+        trials, plans, pretrain_s = zip(*trained, strict=True)
         try:
             seconds, scores = self._fine_tuned(plans, trials, progress, device)
         except DivergedError as error:

@@ -24,6 +24,7 @@ from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
 from memcomp_lightning.studies.plan import Plan, Trial, passes_without_trainer, pretraining_of
 from memcomp_lightning.studies.records import Record
+from memcomp_lightning.studies.worth import Comparison
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass
 
 
@@ -33,28 +34,17 @@ class LikelihoodTrial(Trial):
 
     Attributes:
         value: Learning rate of the first update; held-out data choose one.
+        comparison: What it is part of.
         folder: Of the run: final weights go there.
-        n_reported: Seeds 0 to n - 1, side by side.
-        n_choosing: Further seeds that choose the learning rate; likelihoods score them by held-out images.
         points: Passes after which the RBMs are measured.
-        measure: A key of ``MEASURES``.
-        gradient_draws: Draws of the negative phase whose mean gradient is compared with the exact one.
         greedy_passes: Passes for each layer that come before joint training.
     """
 
     value: float
+    comparison: Comparison
     folder: str
-    n_reported: int
-    n_choosing: int
     points: tuple[int, ...]
-    measure: str
-    gradient_draws: int
-    greedy_passes: int = 0
-
-    @property
-    def n_replicas(self) -> int:
-        """All of them."""
-        return self.n_reported + self.n_choosing
+    greedy_passes: int
 
     @property
     def n_updates(self) -> int:
@@ -73,13 +63,15 @@ class LikelihoodTrial(Trial):
         It runs on one thread and counts seconds of the processor, so that methods can be compared by time while
         other trials run beside.
         """
-        plans = [self.build({**self.settings, "seed": seed}) for seed in range(self.n_replicas)]
+        n_reported = self.comparison.n_reported(self.data_set)
+        n_replicas = n_reported + self.comparison.n_choosing(self.data_set)
+        plans = [self.build({**self.settings, "seed": seed}) for seed in range(n_replicas)]
         stage, module = pretraining_of(plans[0])
         network = stacked([plan.network for plan in plans], ())
-        batches = stage.data.train_batches(0, 1).repeated(range(self.n_replicas))
+        batches = stage.data.train_batches(0, 1).repeated(range(n_replicas))
         _warm_up(joint_model(network), module, next(iter(batches)).v)
-        measure, seconds = MEASURES[self.measure], 0.0
-        score = measure.make(stage.data, self.n_reported)
+        measure, seconds = MEASURES[self.comparison.data_sets[self.data_set].measure], 0.0
+        score = measure.make(stage.data, n_reported)
         begin, reported = time.process_time(), 0
         passes, present_model = _training(self, plans[0], network, batches)
         names = ["score", "reverse"][: 1 + measure.both_ways]
@@ -95,16 +87,16 @@ class LikelihoodTrial(Trial):
                 reported = done.number
                 model, diverged = without_diverged(present_model())
                 scores = [x.double().masked_fill(diverged, math.inf) for x in score(model) if x is not None]
-                bias = gradient_bias(model, module.sampler, done, self.gradient_draws)
+                bias = gradient_bias(model, module.sampler, done, self.comparison.gradient_draws)
                 _add(record, done.number * updates_a_pass, seconds, [x.tolist() for x in (*scores, *bias)])
                 begin = time.process_time()
         except (DivergedError, SettingError):  # the second is a solver's that is given NaN
-            worst, nothing = [math.inf] * self.n_replicas, [math.nan] * self.n_replicas
+            worst, nothing = [math.inf] * n_replicas, [math.nan] * n_replicas
             measured = record.at[-1] if record.at else 0
             for updates in (point * updates_a_pass for point in self.points):
                 if updates > measured:
                     _add(record, updates, seconds, [*(worst for _ in names), nothing, nothing])
-        record = replace(record, held_out=-float(np.median(record.measured("score")[-1, self.n_reported :])))
+        record = replace(record, held_out=-float(np.median(record.measured("score")[-1, n_reported:])))
         with written_whole(weights_path(Path(self.folder), record)) as path:
             torch.save(present_model().state_dict(), path)
         return [record]

@@ -58,7 +58,7 @@ def _section(section: Section) -> str:
         f'<img alt="{escape(caption)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
         for caption, png in section.pictures
     )
-    rows = "\n".join(_row(verdict) for verdict in section.verdicts)
+    rows = "\n".join(map(_row, section.verdicts))
     table = f"<table><tr>{''.join(f'<th>{name}</th>' for name in _HEADER)}</tr>\n{rows}</table>" if rows else ""
     notes = "<br>".join(escape(note) for note in section.notes)
     return f"<h2>{escape(section.title)}</h2>\n{pictures}\n{table}\n<p><small>{notes}</small></p>"

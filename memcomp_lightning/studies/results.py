@@ -54,7 +54,6 @@ class FigurePlan:
 
     Attributes:
         name: "figure4" and so on; begins the names of its files.
-        title: What was trained.
         against: Axis of the curves, "iterations" or "passes".
         passes: Fine-tuning passes after which the networks were tested.
         labels: Names for people, by curve, in the order of the legend.

@@ -39,7 +39,6 @@ class Work(Protocol):
 Run = Callable[[Sequence[Work], Records], None]
 """Does work under one progress bar, and adds the records as soon as they exist."""
 
-
 Do = Callable[[Sequence[Work]], Iterator[list[Record]]]
 
 

@@ -98,6 +98,10 @@ class Comparison:
         """Replicas of a data set that are reported."""
         return self.data_sets[data_set].replicas or self.replicas
 
+    def n_choosing(self, data_set: str) -> int:
+        """Further replicas, which choose the learning rate."""
+        return self.data_sets[data_set].choosing or self.choosing
+
 
 class End(NamedTuple):
     """A method at its best learning rate after its last update: nats of the reported replicas, less is better.

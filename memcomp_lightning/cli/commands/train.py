@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shlex
 import sys
 import traceback
 import warnings
@@ -17,7 +18,7 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli import sweep
-from memcomp_lightning.cli.arguments import CommandLine, as_typed, expanded, from_folder, read, unquoted, with_path
+from memcomp_lightning.cli.arguments import CommandLine, expanded, from_folder, read, unquoted, with_path
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
@@ -149,7 +150,7 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
 
 
 def _go_on(folder: RunFolder) -> str:
-    return f"Go on with: {as_typed(COMMAND, f'resume={short_path(folder.path)}')}"
+    return f"Go on with: {shlex.join([COMMAND, f'resume={short_path(folder.path)}'])}"
 
 
 def _is_first_process() -> bool:
@@ -206,7 +207,7 @@ def main() -> None:
         refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
         if sweep.RememberSweepFolder.folder is not None:
-            raise KeyboardInterrupt(f"Go on with: {as_typed(COMMAND, *sys.argv[1:])}") from interrupt
+            raise KeyboardInterrupt(f"Go on with: {shlex.join([COMMAND, *sys.argv[1:]])}") from interrupt
         raise
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
