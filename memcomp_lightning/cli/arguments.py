@@ -163,9 +163,8 @@ def _readable(override: str, *, multirun: bool) -> str:
     text = text.strip()
     readable = f"{name}={'null' if text == 'None' else text}"
     if parse(readable).is_sweep_override() and not multirun:
-        raise UserError(
-            f"{override} has several values, which are jobs of a sweep: add -m.{_one_value(name, text)}"
-        )
+        hint = _one_value(name, text)
+        raise UserError(f"{override} has several values, which are jobs of a sweep: add -m.{hint}")
     return readable
 
 

@@ -263,19 +263,17 @@ def _check_groups(folder: Path) -> None:
 def search_path(settings: HydraConf) -> list[str]:
     """Where a run looks for groups besides ours, by ``--config-dir`` or ``hydra.searchpath``, as an override."""
     sources = [source for source in settings.runtime.config_sources if "command-line" in source.provider]
-    return [_searching(*(f"{source.schema}://{source.path}" for source in sources))] if sources else []
-
-
-def _searching(*places: str) -> str:
-    return f"{SEARCH_PATH}{list(places)}"
+    places = [f"{source.schema}://{source.path}" for source in sources]
+    return [f"{SEARCH_PATH}{places}"] if places else []
 
 
 def _with_search_path(overrides: Sequence[str], folder: Path) -> list[str]:
     """The overrides with a folder of ``--config-dir`` as one of the places where they look for groups."""
     given = search_paths(overrides)
-    places = parse(given[-1]).value() if given else []
-    assert isinstance(places, list)
-    return [_searching(f"file://{folder}", *map(str, places)), *(o for o in overrides if o not in given)]
+    others = parse(given[-1]).value() if given else []
+    assert isinstance(others, list)
+    places = [f"file://{folder}", *map(str, others)]
+    return [f"{SEARCH_PATH}{places}", *(o for o in overrides if o not in given)]
 
 
 def _check_writable(folder: Path, key: str) -> None:

@@ -28,9 +28,8 @@ def planned_jobs(overrides: Sequence[str], *, config_name: str) -> tuple[list[li
     hydra = compose(config_name, of_sweeper, return_hydra_config=True).hydra
     sweeper, folder = hydra.sweeper, named_by_time(hydra.sweep)
     _check_storage(sweeper.get("storage"))
-    settings = {}
-    for override in [*_parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()]), *parsed]:
-        settings[override.get_key_element()] = override
+    of_params = _parsed([f"{key}={value}" for key, value in (sweeper.params or {}).items()])
+    settings = {override.get_key_element(): override for override in [*of_params, *parsed]}
     if sweeper._target_.endswith(f".{BasicSweeper.__name__}"):
         (jobs,) = BasicSweeper.split_arguments(list(settings.values()), None)
         return jobs, False, folder

@@ -17,7 +17,7 @@ class RememberSweepFolder(Callback):
 
     folder: Path | None = None
 
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+    def on_multirun_start(self, config: DictConfig, **kwargs: object) -> None:
         """Called once, before the jobs."""
         RememberSweepFolder.folder = Path(config.hydra.sweep.dir).absolute()
 

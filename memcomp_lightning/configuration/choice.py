@@ -70,7 +70,7 @@ def trial_of(
     )
 
 
-def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str, Any] | None]:
+def settle(config: DictConfig, folder: RunFolder) -> tuple[DictConfig, dict[str, object] | None]:
     """Try each value; return the settings with the best one, and what was found. Records go to ``choice.jsonl``.
 
     Each value trains without a trainer, on the images that are not held out, and is judged after the last pass.

@@ -130,7 +130,7 @@ def build(config: DictConfig) -> Plan:
     return plan
 
 
-def plan_of(settings: Mapping[str, Any]) -> Plan:
+def plan_of(settings: Mapping[str, object]) -> Plan:
     """Build the objects of a run from its settings as plain values."""
     return build(OmegaConf.create(dict(settings)))
 
@@ -151,7 +151,7 @@ def check_without_trainer(plan: Plan, config: DictConfig) -> None:
     require(max_time is None, "trainer.max_time", max_time, allowed)
 
 
-def _part(settings: Any, name: str) -> Any:
+def _part(settings: object, name: str) -> Any:
     """What settings with a ``_target_`` stand for; None for null."""
     named = settings is None or (isinstance(settings, DictConfig) and "_target_" in settings)
     require(named, name, settings, "null, or settings by name with a _target_")

@@ -25,7 +25,7 @@ from memcomp_lightning.studies.plan import Plan, Stage
 _BY_THE_STAGE = "nothing, each stage sets it"
 _PASSES = "Use pretrain.iterations and finetune.iterations."
 _SUMMARY = "Add ModelSummary of lightning.pytorch.callbacks to callbacks.pretrain or callbacks.finetune."
-_NOT_HERE: dict[str, tuple[tuple[Any, ...], str, str]] = {
+_NOT_HERE: dict[str, tuple[tuple[object, ...], str, str]] = {
     "max_epochs": ((), _BY_THE_STAGE, _PASSES),
     "max_steps": ((-1,), _BY_THE_STAGE, _PASSES),
     "min_steps": ((None,), _BY_THE_STAGE, "Use trainer.min_epochs, passes of a stage or layer."),
@@ -86,11 +86,7 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
 
 
 def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:
-    """The Trainer of one stage; what the stage needs is set here, the rest in the trainer group.
-
-    Raises:
-        SettingError, MisconfigurationException: A setting is not for the user to set, or out of range.
-    """
+    """The Trainer of one stage; what the stage needs is set here, the rest, which is checked, in its group."""
     path = folder.checkpoint(stage.module.stage)
     settings = _settings(config.trainer)
     bars = [type(callback).__name__ for callback in stage.callbacks if isinstance(callback, ProgressBar)]

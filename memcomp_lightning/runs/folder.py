@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,18 +93,18 @@ class RunFolder:
                 "never mixed: choose another folder with hydra.run.dir=PATH, or go back to that version."
             )
 
-    def finish_stage(self, stage: str, record: dict[str, Any]) -> None:
+    def finish_stage(self, stage: str, record: Mapping[str, object]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
         write_json(self.path / "stages.json", {**self.finished_stages, stage: record})
         self.checkpoint(stage).unlink(missing_ok=True)
 
-    def finish(self, result: dict[str, Any]) -> None:
+    def finish(self, result: Mapping[str, object]) -> None:
         """Write the result, with what produced it."""
         origin = {"memcomp_lightning": __version__, **_machine()}
         write_json(self.path / "result.json", {**result, "origin": origin})
         self.forget_error()
 
-    def fail(self, record: dict[str, Any]) -> None:
+    def fail(self, record: Mapping[str, object]) -> None:
         """Write why the run failed."""
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.path / "error.json", record)
@@ -124,10 +124,11 @@ class RunFolder:
                     "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
                 )
 
-    def _same_path(self, name: str, there: Any, now: Any) -> bool:
+    def _same_path(self, name: str, there: object, now: object) -> bool:
         """Whether two values mean the same path: the old one from where it was typed, the new one from here."""
-        paths = is_path(name) and isinstance(there, str) and isinstance(now, str)
-        return paths and self.typed_in / there == Path.cwd() / now
+        if not (is_path(name) and isinstance(there, str) and isinstance(now, str)):
+            return False
+        return self.typed_in / there == Path.cwd() / now
 
     def _read(self, name: str) -> dict[str, Any] | None:
         path = self.path / name

@@ -33,10 +33,10 @@ def run(
     *,
     make_trainer: Callable[[Stage], pl.Trainer],
     loggers: Sequence[Logger] = (),
-    settings: Mapping[str, Any],
+    settings: Mapping[str, object],
     overrides: Mapping[str, str],
     seed: int,
-    choice: dict[str, Any] | None = None,
+    choice: Mapping[str, object] | None = None,
 ) -> dict[str, Any]:
     """Train what is not trained yet, evaluate, and return the result.
 
@@ -156,7 +156,7 @@ def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     return context
 
 
-def _log_final(loggers: Sequence[Logger], settings: Mapping[str, Any], result: dict[str, Any]) -> None:
+def _log_final(loggers: Sequence[Logger], settings: Mapping[str, object], result: dict[str, Any]) -> None:
     """The final numbers, beside the settings in TensorBoard's HParams tab."""
     metrics: dict[str, float] = {}
     if "test_accuracy" in result:

@@ -22,9 +22,8 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
     screen = [[*swept, "runs x replicas", *(measure.title for measure in measures), "wall time"]]
     numbers = [f"{measure.name}_{what}" for measure in measures for what in ("mean", "error")]
     sheet: list[list[object]] = [[*swept, "n_runs", "n_values", *numbers, "wall_time_s"]]
-    for setting, results in sorted(
-        zip(settings, groups.values(), strict=True), key=lambda pair: _order(pair[0], swept)
-    ):
+    rows = zip(settings, groups.values(), strict=True)
+    for setting, results in sorted(rows, key=lambda row: _order(row[0], swept)):
         found = {m.name: [x for result in results for x in m.of(result)] for m in measures}
         seconds = [sum(record["wall_time_s"] for record in result["stages"].values()) for result in results]
         own, mean_s = [setting.get(name, "") for name in swept], sum(seconds) / len(seconds)
@@ -34,7 +33,7 @@ def sweep_table(groups: Mapping[tuple[tuple[str, str], ...], Sequence[dict[str, 
         pairs = [table.mean_and_error(values) if values else ("", "") for values in found.values()]
         sheet.append([*own, len(results), n_values, *(x for pair in pairs for x in pair), mean_s])
     write_text(path, as_csv(sheet))
-    return table.aligned(table.without_empty_columns(screen), most=table.terminal_width())
+    return table.for_screen(screen)
 
 
 class _Measure(NamedTuple):

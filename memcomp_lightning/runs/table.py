@@ -47,9 +47,11 @@ def aligned(rows: Sequence[Sequence[str]], *, most: int | None = None) -> str:
     return "\n".join(texts)
 
 
-def terminal_width() -> int | None:
-    """Columns of the terminal that is printed to; None where the output goes elsewhere."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+def for_screen(rows: Sequence[Sequence[str]]) -> str:
+    """The rows aligned for the terminal that is printed to, without columns that hold nothing below their title."""
+    filled = [any(row[column] for row in rows[1:]) for column in range(len(rows[0]))]
+    kept = [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
+    return aligned(kept, most=shutil.get_terminal_size().columns if sys.stdout.isatty() else None)
 
 
 def final_log_likelihoods(result: dict[str, Any]) -> list[list[float]]:
@@ -65,9 +67,10 @@ def run_table(result: dict[str, Any]) -> str:
     rows = [title]
     likelihoods = final_log_likelihoods(result)
     for name, record in result["stages"].items():
-        gaps = record.get("energy_gap", [])
-        passes = [_passes(n, record["iterations"]) for n in record.get("passes", [])]
-        passes = passes or [str(record["iterations"])] * max(1, len(gaps))
+        gaps, asked = record.get("energy_gap", []), record["iterations"]
+        # Fewer than asked for where something ended the stage before.
+        passes = [str(n) if n == asked else f"{n} of {asked}" for n in record.get("passes", [])]
+        passes = passes or [str(asked)] * max(1, len(gaps))
         for layer, (trained, n, gap) in enumerate(zip(record.get("trained", []), passes, gaps, strict=False)):
             nats = with_error(likelihoods[layer], digits=2) if likelihoods[layer] else ""
             rows.append([f"{name} {trained}", n, with_error(gap), nats, "", ""])
@@ -83,18 +86,7 @@ def run_table(result: dict[str, Any]) -> str:
     chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
     judged = result.get("validation_accuracy")
     held_out = f"\nAccuracy on held-out training images: {with_error(judged)}" if judged else ""
-    return aligned(without_empty_columns(rows), most=terminal_width()) + chosen + held_out
-
-
-def without_empty_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """The rows without the columns that hold nothing below their title."""
-    filled = [any(row[column] for row in rows[1:]) for column in range(len(rows[0]))]
-    return [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
-
-
-def _passes(n: int, iterations: int) -> str:
-    """Passes done, and how many were asked for where something ended the stage before."""
-    return str(n) if n == iterations else f"{n} of {iterations}"
+    return for_screen(rows) + chosen + held_out
 
 
 def closing_lines(folder: Path) -> str:

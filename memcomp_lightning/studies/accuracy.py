@@ -14,7 +14,7 @@ from torch import Tensor
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import stacked
 from memcomp_lightning.studies.plan import Plan, Trial, finetuning_of, passes_without_trainer, pretraining_of
-from memcomp_lightning.studies.records import Record
+from memcomp_lightning.studies.records import Measures, Record
 from memcomp_lightning.training import DivergedError, evaluate, finetune
 from memcomp_lightning.types import Batch
 
@@ -36,7 +36,7 @@ class AccuracyTrial(Trial):
         shared["network"] = [settings["model"]["_target_"], settings["model"]["hidden_sizes"]]
         return json.dumps(shared, sort_keys=True)
 
-    def record(self, passes: Sequence[int], seconds: list[float], scores: dict[str, list[list[float]]]) -> Record:
+    def record(self, passes: Sequence[int], seconds: list[float], scores: Measures) -> Record:
         """What it leaves; held-out images judge by the mean over tested passes and replicas."""
         judged = float(np.mean(scores["validation_accuracy"])) if self.choosing else None
         record = Record.of(self, at=list(passes), seconds=seconds, measures=scores)
@@ -64,10 +64,7 @@ class SideBySide:
     def run(self, progress: Progress) -> list[Record]:
         """Pretrain each network, fine-tune all of them side by side, test after the passes asked for.
 
-        A value that is only tried may diverge: it is then no choice.
-
-        Raises:
-            DivergedError: Naming the curve.
+        A value that is only tried may diverge: it is then no choice. Else a DivergedError names the curve.
         """
         device = device_of(self.trials[0].settings["trainer"]["accelerator"])
         trained, found = [], []

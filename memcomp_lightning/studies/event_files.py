@@ -37,8 +37,7 @@ def write_comparison(worth: Worth, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     charts = {}
     for data_set in worth.data_sets:
-        settings = worth.plan.data_sets[data_set]
-        measure = settings.measure
+        label, measure = worth.plan.data_sets[data_set].label, worth.plan.data_sets[data_set].measure
         name = MEASURES[measure].title
         tags = {
             f"{name}: median over replicas": f"{data_set}/{measure}/median",
@@ -46,7 +45,7 @@ def write_comparison(worth: Worth, folder: Path) -> None:
             "gradient: cosine with the exact one": f"{data_set}/gradient/cosine",
             "gradient: relative error": f"{data_set}/gradient/relative_error",
         }
-        charts[settings.label] = {title: ["Multiline", [tag]] for title, tag in tags.items()}
+        charts[label] = {title: ["Multiline", [tag]] for title, tag in tags.items()}
     for method, own in worth.plan.methods.items():
         found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
         if found:

@@ -23,7 +23,7 @@ from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
 from memcomp_lightning.studies.plan import Plan, Trial, passes_without_trainer, pretraining_of
-from memcomp_lightning.studies.records import Record
+from memcomp_lightning.studies.records import Measures, Record
 from memcomp_lightning.studies.worth import Comparison
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass
 
@@ -75,7 +75,7 @@ class LikelihoodTrial(Trial):
         begin, reported = time.process_time(), 0
         passes, present_model = _training(self, plans[0], network, batches)
         names = ["score", "reverse"][: 1 + measure.both_ways]
-        measures: dict[str, list[list[float]]] = {name: [] for name in (*names, "cosine", "relative_error")}
+        measures: Measures = {name: [] for name in (*names, "cosine", "relative_error")}
         record = Record.of(self, at=[], seconds=[], measures=measures)
         updates_a_pass = sum(batch.closes_step for batch in batches)
         try:

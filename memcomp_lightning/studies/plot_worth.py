@@ -55,10 +55,11 @@ def plot_worth(worth: Worth, data_set: str) -> Figure:
 
 def _finite_range(axes: Axes) -> bool:
     """Leave out what diverged: from the lowest value to a little above the first; say whether any is finite."""
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()])
+    lines = [np.asarray(line.get_ydata(), dtype=float) for line in axes.get_lines()]
+    values = np.concatenate(lines)
     values = values[np.isfinite(values) & (values > 0)]
     if values.size:
-        first = float(np.median([np.asarray(line.get_ydata(), dtype=float)[0] for line in axes.get_lines()]))
+        first = float(np.median([line[0] for line in lines]))
         top = 1.3 * first if math.isfinite(first) else float(values.max())
         axes.set_ylim(float(values.min()) / 1.1, max(top, float(values.min()) * 1.1))
     return bool(values.size)

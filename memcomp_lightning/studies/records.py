@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
 
+Measures = dict[str, list[list[float]]]
 Key = tuple[str, str, float | None, int | None, int | None, bool]
 
 
@@ -53,13 +54,11 @@ class Record(Named):
 
     at: list[int]
     seconds: list[float]
-    measures: dict[str, list[list[float]]]
+    measures: Measures
     held_out: float | None = None
 
     @classmethod
-    def of(
-        cls, trial: Named, *, at: list[int], seconds: list[float], measures: dict[str, list[list[float]]]
-    ) -> "Record":
+    def of(cls, trial: Named, *, at: list[int], seconds: list[float], measures: Measures) -> "Record":
         """What a trial leaves, not judged yet."""
         names = {field.name: getattr(trial, field.name) for field in fields(Named)}
         return cls(**names, at=at, seconds=seconds, measures=measures)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Client, Connection, Listener
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from joblib import Parallel, delayed
@@ -106,7 +106,7 @@ _first: Connection | None = None
 """In a worker, the line to the first process."""
 
 
-def _begin_worker(address: Any, key: bytes) -> None:
+def _begin_worker(address: str | tuple[str, int], key: bytes) -> None:
     global _first
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
     _first = Client(address, authkey=key)

@@ -38,9 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sections = [write_report(folder) for folder in given.folders]
         output = given.output or given.folders[0] / "report.html"
         write_text(output, page(sections))
-    except (UserError, SettingError) as error:
-        refuse(COMMAND, error)
-    except OSError as error:
+    except (UserError, SettingError, OSError) as error:
         refuse(COMMAND, UserError(in_words(error)))
     for section in sections:
         if section.verdicts:

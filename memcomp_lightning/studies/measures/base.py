@@ -50,11 +50,7 @@ class Measure:
 
 
 def negative_log_likelihood(data: ImageDataModule, n_reported: int) -> Callable[[EnergyModel, Tensor], Tensor]:
-    """Negative log-likelihood of each replica, given its log Z; see :class:`Measure`.
-
-    Raises:
-        SettingError: Nothing is held out.
-    """
+    """Negative log-likelihood of each replica, given its log Z; see :class:`Measure`. Images must be held out."""
     if data.validation is None:
         allowed = "above 0 where log-likelihoods are measured: held-out images choose the learning rates"
         raise SettingError(f"data.validation_fraction = 0.0 is not allowed: expected {allowed}.")

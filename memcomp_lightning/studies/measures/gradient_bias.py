@@ -20,10 +20,8 @@ from memcomp_lightning.types import Configurations
 def without_diverged(model: EnergyModel) -> tuple[EnergyModel, Tensor]:
     """A copy in which replicas that left the finite numbers are zero, and which they are, ``(*replicas,)``."""
     n = len(model.replicas)
-    largest = torch.stack([p.flatten(n).abs().amax(-1).nan_to_num(nan=math.inf) for p in model.parameters()]).amax(
-        0
-    )
-    diverged = largest > LARGEST_WEIGHT
+    largest = [p.flatten(n).abs().amax(-1).nan_to_num(nan=math.inf) for p in model.parameters()]
+    diverged = torch.stack(largest).amax(0) > LARGEST_WEIGHT
     kept = copy.deepcopy(model)
     for parameter in kept.parameters():
         parameter.masked_fill_(diverged.view((*diverged.shape, *[1] * (parameter.ndim - n))), 0.0)
@@ -57,9 +55,8 @@ def mean_gradient(
     """The mean gradient over draws from one state; mode assistance counts both of its updates by probability."""
 
     def drawn(sample: Any, state: Any) -> Tensor:
-        return gradient(
-            model, positive, sample(model, state, positive, generator=generator).configurations
-        ).double()
+        negative = sample(model, state, positive, generator=generator).configurations
+        return gradient(model, positive, negative).double()
 
     if isinstance(sampler, ModeAssisted):
         p = sampler.schedule.probability(int(state.n_done))
