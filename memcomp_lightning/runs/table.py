@@ -48,7 +48,7 @@ def aligned(rows: Sequence[Sequence[str]], *, most: int | None = None) -> str:
 
 
 def for_screen(rows: Sequence[Sequence[str]]) -> str:
-    """The rows aligned for the terminal that is printed to, without columns that hold nothing below their title."""
+    """The rows aligned for the terminal, if there is one, without columns that hold nothing below their title."""
     filled = [any(row[column] for row in rows[1:]) for column in range(len(rows[0]))]
     kept = [[cell for cell, keep in zip(row, filled, strict=True) if keep] for row in rows]
     return aligned(kept, most=shutil.get_terminal_size().columns if sys.stdout.isatty() else None)

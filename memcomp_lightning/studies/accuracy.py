@@ -137,8 +137,6 @@ class SideBySide:
 _IN_CACHE = 40
 """Small networks that one CPU core trains fastest side by side: more of them no longer fit into its cache."""
 
-_ON_GPU = 10_000
-
 
 def grouped(
     trials: Sequence[AccuracyTrial], passes: tuple[int, ...], *, networks: int | None = None
@@ -155,7 +153,8 @@ def grouped(
         data = finetuning_of(plan_of(alike[0], passes[-1]))[0].data
         n_replicas = math.prod(data.replicas)
         on_cpu = device_of(alike[0].settings["trainer"]["accelerator"]).type == "cpu"
-        at_once = networks if networks is not None else _IN_CACHE if on_cpu else _ON_GPU
+        usual = _IN_CACHE if on_cpu else 10_000
+        at_once = usual if networks is None else networks
         require_count("figure.networks", at_once)
         each = len(data.train_batches(0, 1)) * n_replicas * passes[-1]
         most = max(1, at_once // n_replicas)
