@@ -116,12 +116,11 @@ class RunFolder:
     def _check_same(self, path: Path, config: DictConfig) -> None:
         there, now = _flat(OmegaConf.load(path)), _flat(config)
         for name in sorted(there.keys() | now.keys()):
-            if name.startswith(_FREE_TO_CHANGE) or there.get(name) == now.get(name):
-                continue
-            if not self._same_path(name, there.get(name), now.get(name)):
+            old, new = there.get(name), now.get(name)
+            if not (name.startswith(_FREE_TO_CHANGE) or old == new or self._same_path(name, old, new)):
                 raise UserError(
-                    f"run folder {self.path} was made with {name}={there.get(name)}, not {now.get(name)}: choose "
-                    "another with hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
+                    f"run folder {self.path} was made with {name}={old}, not {new}: choose another with "
+                    "hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."
                 )
 
     def _same_path(self, name: str, there: object, now: object) -> bool:
@@ -158,10 +157,7 @@ def _source() -> str:
     return digest.hexdigest()[:8]
 
 
-_FREE_TO_CHANGE = (
-    *("logger.", "checkpoint_every", "figure.workers"),
-    *("data.source.data_dir", "data.source.download"),
-)
+_FREE_TO_CHANGE = ("logger.", "checkpoint_every", "data.source.data_dir", "data.source.download", "figure.workers")
 """Settings that do not change what is computed."""
 
 
