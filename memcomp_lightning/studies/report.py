@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, write_text, written_whole
-from memcomp_lightning.studies.event_files import write_comparison, write_event_file
 from memcomp_lightning.studies.page import Section, markdown
 from memcomp_lightning.studies.plot_accuracy import accuracy_figures
 from memcomp_lightning.studies.plot_worth import plot_worth
 from memcomp_lightning.studies.results import read_results
 from memcomp_lightning.studies.verdicts import RULE, verdicts
 from memcomp_lightning.studies.worth import WORTH_RULE, read_worth, worth_table, worth_verdicts
+from memcomp_lightning.studies.worth_report import write_event_file, write_events
 
 
 def write_report(folder: Path) -> Section:
@@ -39,7 +39,7 @@ def write_report(folder: Path) -> Section:
         name, title, rule = "sampler_worth", worth.plan.title, WORTH_RULE
         figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
         numbers, judged = as_csv(worth_table(worth)), worth_verdicts(worth)
-        write_comparison(worth, folder / "tensorboard")
+        write_events(worth, folder / "tensorboard")
     else:
         results = read_results(folder)
         _check_measured(folder, bool(results.curves))

@@ -1,4 +1,4 @@
-"""TensorBoard's event files, which reports write where TensorBoard is installed."""
+"""TensorBoard's event files: of all studies, and what they show of ``experiment=sampler_worth``."""
 
 import logging
 import shutil
@@ -29,7 +29,7 @@ def write_event_file(folder: Path, write: Callable[["SummaryWriter"], None]) -> 
         write(writer)
 
 
-def write_comparison(worth: Worth, folder: Path) -> None:
+def write_events(worth: Worth, folder: Path) -> None:
     """A run for each method at its best rates, a group of charts for each data set, settings in the HParams tab.
 
     One run for all data sets: TensorBoard shows nothing at first where there are more than forty.
