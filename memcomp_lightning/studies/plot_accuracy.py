@@ -28,13 +28,14 @@ def accuracy_figures(results: Results) -> dict[str, Figure]:
     return controls
 
 
-def plot_against_iterations(results: Results) -> Figure:
+def plot_against_iterations(results: Results, *, width: float = 7.2, height: float = 3.1) -> Figure:
     """A panel for each number of passes (Figs. 4 and 5): curves with sigma / sqrt(n), arrows with their lengths.
 
-    Curves with several pretraining lengths are lines; networks without pretraining are level lines.
+    Curves with several pretraining lengths are lines; networks without pretraining are level lines. A panel has
+    ``width`` and ``height``, in inches.
     """
     passes = results.plan.passes
-    figure = Figure(figsize=(7.2, 3.1 * len(passes) + 0.5), layout="constrained")
+    figure = Figure(figsize=(width, height * len(passes) + 0.5), layout="constrained")
     panels = figure.subplots(len(passes), 1, sharex=True, squeeze=False)[:, 0]
     lines = [curve for curve in results.curves if len(results.lengths(curve)) > 1]
     levels = [
@@ -59,9 +60,9 @@ def plot_against_iterations(results: Results) -> Figure:
     return figure
 
 
-def plot_against_passes(results: Results) -> Figure:
-    """Accuracy against fine-tuning passes (Fig. 6), the end of training in the inset."""
-    figure = Figure(figsize=(6.8, 4.6), layout="constrained")
+def plot_against_passes(results: Results, *, width: float = 6.8, height: float = 4.6) -> Figure:
+    """Accuracy against fine-tuning passes (Fig. 6), the end of training in the inset; sizes are in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots()
     passes = results.plan.passes
     inset = axes.inset_axes((0.42, 0.12, 0.55, 0.5))
@@ -77,11 +78,11 @@ def plot_against_passes(results: Results) -> Figure:
     return figure
 
 
-def plot_controls(results: Results) -> Figure:
-    """Every curve at its last N after each number of passes: mean and standard error, a row each."""
+def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
+    """Every curve at its last N after each number of passes: mean and standard error, a row each; inches."""
     passes = results.plan.passes if len(results.plan.passes) <= 4 else results.plan.passes[-1:]
     curves, claimed = results.curves, results.plan.claimed
-    figure = Figure(figsize=(7.2, 0.26 * len(curves) + 1.2), layout="constrained")
+    figure = Figure(figsize=(width, 0.26 * len(curves) + 1.2), layout="constrained")
     panels = figure.subplots(1, len(passes), sharey=True, squeeze=False)[0]
     rows = np.arange(len(curves))[::-1]
     for axes, done in zip(panels, passes, strict=True):

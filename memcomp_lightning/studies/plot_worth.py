@@ -10,13 +10,13 @@ from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.worth import Worth
 
 
-def plot_worth(worth: Worth, data_set: str) -> Figure:
+def plot_worth(worth: Worth, data_set: str, *, width: float = 13.0, height: float = 4.6) -> Figure:
     """Panels of one data set: score against updates and seconds, and, if known, cosine with the exact gradient.
 
     Lines are medians over replicas, each method at its best learning rate; the dotted line of a judged method is
-    its worst replica.
+    its worst replica. Sizes are in inches.
     """
-    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     records = {method: worth.best(data_set, method) for method in worth.methods(data_set)}
     has_bias = any(np.isfinite(worth.values(record, "cosine")).any() for record in records.values())
     panels = figure.subplots(1, 3 if has_bias else 2)
