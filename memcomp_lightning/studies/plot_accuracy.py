@@ -79,7 +79,7 @@ def plot_against_passes(results: Results, *, width: float = 6.8, height: float =
 
 
 def plot_controls(results: Results, *, width: float = 7.2) -> Figure:
-    """Every curve at its last N after each number of passes: mean and standard error, a row each; inches."""
+    """Every curve at its last N after each number of passes: mean and standard error, a row each; inches wide."""
     passes = results.plan.passes if len(results.plan.passes) <= 4 else results.plan.passes[-1:]
     curves, claimed = results.curves, results.plan.claimed
     figure = Figure(figsize=(width, 0.26 * len(curves) + 1.2), layout="constrained")
