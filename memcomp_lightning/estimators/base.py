@@ -1,108 +1,131 @@
-"""What both estimators share: reading of inputs, seeds, waiting for a better score."""
+"""What both estimators share: reading of inputs, seeds, the passes of ``fit`` and when they end."""
 
 import copy
+from abc import abstractmethod
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from sklearn.utils import check_random_state
+from numpy.typing import ArrayLike
+from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Generator, Tensor, nn
 from torch.optim import SGD
 
+from memcomp_lightning.data import Batches
+from memcomp_lightning.defaults import CENTRING_RATE
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.estimators.inputs import Matrix, Scaling
+from memcomp_lightning.estimators.inputs import Array, Matrix, Samples, Scaling
 from memcomp_lightning.estimators.settings import NestedSettings
 from memcomp_lightning.models import DBN
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.training import BestPass, ClassifierTraining, OptimizerFactory, PhaseTraining
 
-PRECISIONS = (np.float64, np.float32)
+RandomState = int | np.random.RandomState | np.random.Generator | None
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class MemcompEstimator(NestedSettings):
     """Base of both estimators: reads dense and sparse inputs, float64 or float32; scales what leaves [0, 1]."""
 
     _scaling: Scaling
+    _training: PhaseTraining | ClassifierTraining
 
-    def __sklearn_tags__(self) -> Any:
+    def __sklearn_tags__(self) -> Tags:
         tags = super().__sklearn_tags__()
         tags.input_tags.sparse = True
         if tags.transformer_tags is not None:
             tags.transformer_tags.preserves_dtype = ["float64", "float32"]
         return tags
 
-    def _read(self, X: Any, y: Any = "no_validation", *, reset: bool, **checks: Any) -> Any:
-        return validate_data(self, X, y, accept_sparse="csr", dtype=PRECISIONS, reset=reset, **checks)
+    @abstractmethod
+    def _batches(self, samples: Samples) -> Batches:
+        """The updates of a pass over scaled samples."""
 
-    def _checked(self, X: Any) -> Matrix:
+    @abstractmethod
+    def _score_held_out(self, samples: Samples) -> float:
+        """What early stopping maximises."""
+
+    def _read(self, X: ArrayLike, *, reset: bool, **of_labels: object) -> Matrix:
+        precisions = (np.float64, np.float32)
+        return validate_data(self, X, accept_sparse="csr", dtype=precisions, reset=reset, **of_labels)
+
+    def _checked(self, X: ArrayLike) -> Matrix:
         """Scaled data for a fitted model."""
         check_is_fitted(self)
         return self._scaling.apply(self._read(X, reset=False))
 
-    def _check_early_stopping(self) -> None:
-        if not self.early_stopping:
-            return
-        fraction = self.validation_fraction
-        require(0 < fraction < 1, "validation_fraction", fraction, "a number between 0 and 1")
-        require_count("n_iter_no_change", self.n_iter_no_change)
-        require(self.tol >= 0, "tol", self.tol, "a number >= 0")
+    def _scaled(self, samples: Samples, *, begins: bool) -> Samples:
+        if begins:
+            self._scaling = Scaling.of(samples.X)
+        return samples._replace(X=self._scaling.apply(samples.X))
+
+    def _check_settings(self) -> None:
+        require_count("n_iter", self.n_iter)
+        if self.batch_size is not None:
+            require_count("batch_size", self.batch_size)
+        self._optimizer()
+        if self.early_stopping:
+            fraction = self.validation_fraction
+            require(0 < fraction < 1, "validation_fraction", fraction, "a number between 0 and 1")
+            require_count("n_iter_no_change", self.n_iter_no_change)
+            require(self.tol >= 0, "tol", self.tol, "a number >= 0")
 
     def _refuse_early_stopping(self) -> None:
         if self.early_stopping:
             raise ValueError("partial_fit sees a part of the data: set early_stopping=False for it, or use fit.")
 
-    def _say(self, done: int, of: int, score: float | None) -> None:
-        if self.verbose:
-            held_out = "" if score is None else f", score of held-out samples {score:.4f}"
-            print(f"[{type(self).__name__}] pass {done} of {of}{held_out}", flush=True)
+    def _optimizer(self) -> OptimizerFactory:
+        return sgd(self.learning_rate, getattr(self, "momentum", 0.0))
+
+    def _centring(self) -> Centring | None:
+        return Centring(rate=CENTRING_RATE) if self.centred else None
+
+    def _run_pass(self, batches: Batches) -> None:
+        batches.set_epoch(self.n_iter_)
+        self._training.run_pass(batches)
+        self.n_iter_ += 1
+
+    def _run_passes(self, network: nn.Module, samples: Samples, held_out: Samples | None) -> None:
+        """Do the passes of ``fit``; held-out samples say when to stop, and choose the weights."""
+        batches, best, n_waited = self._batches(samples), BestPass(), 0
+        scores: list[float] = []
+        for _ in range(self.n_iter):
+            self._run_pass(batches)
+            score = None if held_out is None else self._score_held_out(held_out)
+            if self.verbose:
+                said = "" if score is None else f", score of held-out samples {score:.4f}"
+                print(f"[{type(self).__name__}] pass {self.n_iter_} of {self.n_iter}{said}", flush=True)
+            if score is not None:
+                n_waited = 0 if score > max(scores, default=-np.inf) + self.tol else n_waited + 1
+                scores.append(score)
+                best.offer(torch.tensor(score, dtype=torch.float64), network.state_dict())
+                if n_waited >= self.n_iter_no_change:
+                    break
+        if held_out is not None:
+            network.load_state_dict(best.weights)
+        self.validation_scores_ = None if held_out is None else scores
+
+    def _go_on(self, network: nn.Module, samples: Samples) -> None:
+        """Do the pass of ``partial_fit``, with the settings of now; data of another precision take the model's."""
+        for group in self._training.optimizer.param_groups:
+            group |= {"lr": self.learning_rate, "momentum": getattr(self, "momentum", 0.0)}
+        if samples.X.shape[0]:  # none of them may have a label
+            dtype = next(network.parameters()).detach().numpy().dtype
+            self._run_pass(self._batches(samples.astype(dtype)))
+        self.validation_scores_ = None
 
 
-class Patience:
-    """Keeps the best weights of a model by a held-out score, and says when to stop.
-
-    Args:
-        module: The model.
-        tol: By how much a score must be better to count, >= 0.
-        n_iter_no_change: Passes in a row that may go by without such a score, >= 1.
-
-    Attributes:
-        scores: So far.
-    """
-
-    def __init__(self, module: nn.Module, *, tol: float, n_iter_no_change: int) -> None:
-        self._module, self._tol, self._most = module, tol, n_iter_no_change
-        self._best = -np.inf
-        self._state: dict[str, Tensor] = copy.deepcopy(module.state_dict())
-        self._waited = 0
-        self.scores: list[float] = []
-
-    def ends_with(self, score: float) -> bool:
-        """Take the score of the newest pass; return whether it was the last one."""
-        self._waited = 0 if score > self.best + self._tol else self._waited + 1
-        if score > self._best:
-            self._best, self._state = score, copy.deepcopy(self._module.state_dict())
-        self.scores.append(score)
-        return self._waited >= self._most
-
-    @property
-    def best(self) -> float:
-        """The best score."""
-        return float(self._best)
-
-    def restore(self) -> None:
-        """Give the model its best weights."""
-        self._module.load_state_dict(self._state)
-
-
-def seed_of(random_state: Any) -> int:
+def seed_of(random_state: RandomState) -> int:
     """Return a seed drawn from a seed, one of NumPy's generators, or None for NumPy's global one."""
     if isinstance(random_state, np.random.Generator):
         return int(random_state.integers(2**31 - 1))
     return int(check_random_state(random_state).randint(2**31 - 1))
 
 
-def sgd(learning_rate: float, momentum: float = 0.0, name: str = "learning_rate") -> Any:
+def sgd(learning_rate: float, momentum: float = 0.0, name: str = "learning_rate") -> OptimizerFactory:
     """Return what builds an optimiser."""
     require(learning_rate > 0, name, learning_rate, "a number > 0")
     require(0 <= momentum < 1, "momentum", momentum, "a number in [0, 1)")
@@ -131,14 +154,13 @@ def dbn_for(X: Matrix, sizes: list[int], *, std: float, generator: Generator) ->
     return DBN(X.shape[1], sizes, weight_init=Drawn(std, dtype), generator=generator).to(dtype)
 
 
-def in_precision_of(X: Matrix, module: Any) -> tuple[Matrix, Any]:
+def in_precision_of(X: Matrix, module: ModuleT) -> tuple[Matrix, ModuleT]:
     """Return both in the higher of their precisions."""
     if next(module.parameters()).dtype == torch.float64:
         return X.astype(np.float64, copy=False), module
     return X, copy.deepcopy(module).double() if X.dtype == np.float64 else module
 
 
-def array_of(values: Tensor, like: Matrix) -> NDArray[Any]:
+def array_of(values: Tensor, like: Matrix) -> Array:
     """Return an array in the precision of the input."""
-    array: NDArray[Any] = values.detach().numpy()
-    return array.astype(like.dtype, copy=False)
+    return np.asarray(values.detach().numpy().astype(like.dtype, copy=False))

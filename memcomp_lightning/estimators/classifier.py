@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.base import ClassifierMixin
 from sklearn.model_selection import train_test_split
 from sklearn.utils.multiclass import _check_partial_fit_first_call, check_classification_targets
@@ -15,9 +15,9 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
+from memcomp_lightning.data import Batches
 from memcomp_lightning.defaults import (
     BATCH_SIZE,
-    CENTRING_RATE,
     FINETUNING_LEARNING_RATE,
     FINETUNING_MOMENTUM,
     FINETUNING_PASSES,
@@ -28,18 +28,16 @@ from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.estimators.base import (
     Drawn,
     MemcompEstimator,
-    Patience,
+    RandomState,
     array_of,
     dbn_for,
     in_precision_of,
     seed_of,
     sgd,
 )
-from memcomp_lightning.estimators.inputs import Matrix, Scaling, batches_of, hidden_means, log_odds_of, weights_of
-from memcomp_lightning.models import DBN
+from memcomp_lightning.estimators.inputs import Array, Matrix, Samples, batches_of, hidden_means, log_odds_of
 from memcomp_lightning.modules import DBNClassifier
-from memcomp_lightning.objective import Centring
-from memcomp_lightning.samplers import GroundState
+from memcomp_lightning.samplers import GroundState, NegativePhaseSampler
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.training import ClassifierTraining, Greedy, Joint, pretrain, require_finite
 
@@ -94,7 +92,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         self,
         hidden_layer_sizes: int | Sequence[int] = (32, 32),
         *,
-        sampler: Any = None,
+        sampler: NegativePhaseSampler[Any, Any] | None = None,
         pretrain: Literal["greedy", "joint"] = "greedy",
         n_iter_pretrain: int = PASSES,
         pretrain_learning_rate: float = LEARNING_RATE,
@@ -110,7 +108,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         n_iter_no_change: int = 10,
         tol: float = 1e-4,
         verbose: bool = False,
-        random_state: Any = None,
+        random_state: RandomState = None,
     ) -> None:
         self.hidden_layer_sizes = hidden_layer_sizes
         self.sampler = sampler
@@ -134,7 +132,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
     def _default_sampler(self) -> GroundState:
         return GroundState(solver=DmmSolver())
 
-    def fit(self, X: Any, y: Any, sample_weight: ArrayLike | None = None) -> "MemcompDBNClassifier":
+    def fit(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> Self:
         """Train from new weights.
 
         Args:
@@ -147,59 +145,43 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
             DivergedError: A parameter left the finite numbers.
         """
         self._check_settings()
-        X, y = self._read_labelled(X, y, reset=True)
-        weight = weights_of(sample_weight, X)
-        if weight is not None:
-            X, y, weight = X[weight > 0], y[weight > 0], weight[weight > 0]
-        labelled = _has_label(y)
-        self.classes_ = np.unique(y[labelled])
+        samples = self._read_labelled(X, y, sample_weight, reset=True)
+        labelled = _has_label(samples.label)
+        self.classes_ = np.unique(samples.label[labelled])
         if len(self.classes_) < 2:
             beside = "" if labelled.all() else f" beside {UNLABELLED}, which marks unlabelled samples"
             raise ValueError(
                 f"y holds one class, {self.classes_.tolist()}{beside}: a classifier needs at least 2 classes."
             )
         seed = seed_of(self.random_state)
-        self._scaling = Scaling.of(X)
-        X, label = self._scaling.apply(X), self._encoded(y, labelled)
-        rows, held_out = np.flatnonzero(labelled), np.array([], dtype=np.int64)
+        samples = self._scaled(self._encoded(samples, labelled), begins=True)
+        rows, others = np.flatnonzero(labelled), np.array([], dtype=np.int64)
         if self.early_stopping:
-            rows, held_out = train_test_split(
-                rows, test_size=self.validation_fraction, random_state=seed, stratify=label[rows]
+            rows, others = train_test_split(
+                rows, test_size=self.validation_fraction, random_state=seed, stratify=samples.label[rows]
             )
-        seen = np.setdiff1d(np.arange(X.shape[0]), held_out)
 
-        def part(of: NDArray[Any]) -> tuple[Matrix, NDArray[Any], NDArray[Any] | None]:
-            if len(of) == X.shape[0]:
-                return X, label, weight
-            return X[of], label[of], None if weight is None else weight[of]
+        def part(of: Array) -> Samples:
+            return samples if len(of) == len(labelled) else samples.take(of)
 
         with on_the_cpu():
-            self._begin(*part(seen), seed)
-            patience = Patience(self.network_, tol=self.tol, n_iter_no_change=self.n_iter_no_change)
-            batches, validation = self._batches(*part(np.sort(rows))), part(held_out)
-            for _ in range(self.n_iter):
-                self._run_pass(batches)
-                score = self._accuracy(*validation) if self.early_stopping else None
-                self._say(self.n_iter_, self.n_iter, score)
-                if score is not None and patience.ends_with(score):
-                    break
-            if self.early_stopping:
-                patience.restore()
+            self._begin(part(np.setdiff1d(np.arange(len(labelled)), others)), seed)
+            held_out = part(others) if self.early_stopping else None
+            self._run_passes(self.network_, part(np.sort(rows)), held_out)
             require_finite(self.network_, "fine-tuning")
-        self.validation_scores_ = patience.scores if self.early_stopping else None
         return self
 
     def partial_fit(
         self,
-        X: Any,
-        y: Any,
+        X: ArrayLike,
+        y: ArrayLike,
         classes: ArrayLike | None = None,
         sample_weight: ArrayLike | None = None,
-    ) -> "MemcompDBNClassifier":
+    ) -> Self:
         """Do one pass of back-propagation over these samples; the optimiser goes on from the last call.
 
         The first call, unless it follows ``fit``, draws the weights, settles the scaling and pretrains, all of it
-        on its own samples.
+        on its own samples. Errors are those of :meth:`fit`, and one more.
 
         Args:
             X: As in :meth:`fit`.
@@ -209,8 +191,6 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
 
         Raises:
             ValueError: ``classes`` is missing, has changed or holds -1, or y holds another label.
-            SettingError: A setting is out of range.
-            DivergedError: A parameter left the finite numbers.
         """
         self._check_settings()
         self._refuse_early_stopping()
@@ -222,42 +202,29 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
                 f"classes holds {UNLABELLED}, which marks unlabelled samples, among {given}: leave it out. It is "
                 "a class only if the classes are -1 and 1."
             )
-        X, y = self._read_labelled(X, y, reset=begins)
-        weight = weights_of(sample_weight, X)
-        if weight is not None:
-            X, y, weight = X[weight > 0], y[weight > 0], weight[weight > 0]
+        samples = self._read_labelled(X, y, sample_weight, reset=begins)
+        y = samples.label
         known = np.isin(y, self.classes_)
         labelled = known | ~_is_unlabelled(y)
         if not known[labelled].all():
             unknown = np.unique(y[labelled & ~known]).tolist()
             raise ValueError(f"y holds {unknown}, which is not among the classes {self.classes_.tolist()}.")
-        if begins:
-            self._scaling = Scaling.of(X)
-        X, label = self._scaling.apply(X), self._encoded(y, labelled)
+        samples = self._scaled(self._encoded(samples, labelled), begins=begins)
         with on_the_cpu():
             if begins:
-                self._begin(X, label, weight, seed_of(self.random_state))
-            for group in self._training.optimizer.param_groups:
-                group |= {"lr": self.learning_rate, "momentum": self.momentum}
-            X = X.astype(_numpy_dtype(self.network_), copy=False)
-            if labelled.any():
-                weight = None if weight is None else weight[labelled].astype(X.dtype)
-                self._run_pass(self._batches(X[labelled], label[labelled], weight))
+                self._begin(samples, seed_of(self.random_state))
+            self._go_on(self.network_, samples.take(labelled))
             require_finite(self.network_, "fine-tuning")
-        self.validation_scores_ = None
         return self
 
     def _check_settings(self) -> None:
         require_choice("pretrain", self.pretrain, ("greedy", "joint"))
         require_count("n_iter_pretrain", self.n_iter_pretrain, minimum=0)
-        require_count("n_iter", self.n_iter)
-        for name in ("batch_size", "pretrain_batch_size"):
-            if getattr(self, name) is not None:
-                require_count(name, getattr(self, name))
+        if self.pretrain_batch_size is not None:
+            require_count("pretrain_batch_size", self.pretrain_batch_size)
         require(self.weight_std > 0, "weight_std", self.weight_std, "a number > 0")
-        sgd(self.learning_rate, self.momentum)
         sgd(self.pretrain_learning_rate, name="pretrain_learning_rate")
-        self._check_early_stopping()
+        super()._check_settings()
         self._sizes()
 
     def _sizes(self) -> list[int]:
@@ -267,64 +234,58 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
             require_count("hidden_layer_sizes", size)
         return [int(size) for size in sizes]
 
-    def _read_labelled(self, X: Any, y: Any, *, reset: bool) -> tuple[Matrix, NDArray[Any]]:
-        X, y = self._read(X, y, reset=reset, multi_output=True)
-        if y.ndim == 2 and y.shape[1] > 1:
+    def _read_labelled(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None, *, reset: bool
+    ) -> Samples:
+        X, label = self._read(X, y=y, multi_output=True, reset=reset)
+        if label.ndim == 2 and label.shape[1] > 1:
             raise ValueError(
-                f"y has the shape {y.shape}: expected one label a sample, y should be a 1d array. For several "
+                f"y has the shape {label.shape}: expected one label a sample, y should be a 1d array. For several "
                 "labels a sample use sklearn.multioutput.MultiOutputClassifier."
             )
-        y = column_or_1d(y, warn=True)
-        if len(labels := y[~_is_unlabelled(y)]):
-            check_classification_targets(labels)
-        return X, y
+        label = column_or_1d(label, warn=True)
+        if len(known := label[~_is_unlabelled(label)]):
+            check_classification_targets(known)
+        return Samples.that_count(X, label, sample_weight)
 
-    def _encoded(self, y: NDArray[Any], labelled: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Indices of the classes; 0 for unlabelled samples, which is not looked at."""
-        label = np.zeros(len(y), dtype=np.int64)
-        label[labelled] = np.searchsorted(self.classes_, y[labelled])
-        return label
+    def _encoded(self, samples: Samples, labelled: Array) -> Samples:
+        """Labels as indices of the classes; 0 for unlabelled samples, which is not looked at."""
+        label = np.zeros(len(labelled), dtype=np.int64)
+        label[labelled] = np.searchsorted(self.classes_, samples.label[labelled])
+        return samples._replace(label=label)
 
-    def _begin(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None, seed: int) -> None:
+    def _begin(self, samples: Samples, seed: int) -> None:
         """Draw and pretrain the layers, draw the output layer."""
-        dbn = dbn_for(X, self._sizes(), std=self.weight_std, generator=rng.stream(seed, "weights"))
+        dbn = dbn_for(samples.X, self._sizes(), std=self.weight_std, generator=rng.stream(seed, "weights"))
         with torch.no_grad():
-            dbn[0].b.copy_(torch.from_numpy(log_odds_of(X, weight)))
-        sampler = self._default_sampler() if self.sampler is None else self.sampler
-        batches = batches_of(X, label, weight, batch_size=self.pretrain_batch_size, sampler=sampler, seed=seed)
-        stage = Joint(dbn) if self.pretrain == "joint" else Greedy(dbn)
+            dbn[0].b.copy_(log_odds_of(samples))
+        sampler = self._negative_phase()
         passes = pretrain(
-            stage,
-            batches,
+            Joint(dbn) if self.pretrain == "joint" else Greedy(dbn),
+            batches_of(samples, batch_size=self.pretrain_batch_size, sampler=sampler, seed=seed),
             sampler,
             iterations=self.n_iter_pretrain,
             optimizer=sgd(self.pretrain_learning_rate),
-            centring=Centring(rate=CENTRING_RATE) if self.centred else None,
+            centring=self._centring(),
             seed=seed,
         )
         for _ in passes:
             pass
-        self.network_ = self._with_output(dbn, rng.stream(seed, "output weights"))
+        output_init = Drawn(self.weight_std, dbn[0].weight.dtype)
+        generator = rng.stream(seed, "output weights")
+        n_classes = len(self.classes_)
+        self.network_ = DBNClassifier(
+            dbn, n_classes=n_classes, output_init=output_init, generator=generator
+        ).network
         self._seed, self.n_iter_ = seed, 0
-        self._training = ClassifierTraining(self.network_, optimizer=sgd(self.learning_rate, self.momentum))
+        self._training = ClassifierTraining(self.network_, optimizer=self._optimizer())
 
-    def _with_output(self, dbn: DBN, generator: torch.Generator) -> torch.nn.Module:
-        init = Drawn(self.weight_std, dbn[0].weight.dtype)
-        module = DBNClassifier(dbn, n_classes=len(self.classes_), output_init=init, generator=generator)
-        network: torch.nn.Module = module.network
-        return network
+    def _batches(self, samples: Samples) -> Batches:
+        return batches_of(samples, batch_size=self.batch_size, seed=self._seed)
 
-    def _batches(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None) -> Any:
-        return batches_of(X, label, weight, batch_size=self.batch_size, seed=self._seed)
-
-    def _run_pass(self, batches: Any) -> None:
-        batches.set_epoch(self.n_iter_)
-        self._training.run_pass(batches)
-        self.n_iter_ += 1
-
-    def _accuracy(self, X: Matrix, label: NDArray[Any], weight: NDArray[Any] | None) -> float:
-        right = self._logits(self.network_, X).argmax(-1).numpy() == label
-        return float(np.average(right, weights=weight))
+    def _score_held_out(self, samples: Samples) -> float:
+        right = self._logits(self.network_, samples.X).argmax(-1).numpy() == samples.label
+        return float(np.average(right, weights=samples.weight))
 
     @torch.no_grad()
     def _logits(self, network: Any, X: Matrix) -> Tensor:
@@ -335,21 +296,20 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         logits: Tensor = output(h)
         return logits
 
-    def predict_proba(self, X: Any) -> NDArray[Any]:
+    def predict_proba(self, X: ArrayLike) -> Array:
         """Probability of each class, ``(n_samples, n_classes)``, in the precision of X."""
         X = self._checked(X)
         with on_the_cpu():
             data, network = in_precision_of(X, self.network_)
             return array_of(torch.softmax(self._logits(network, data), dim=-1), like=X)
 
-    def predict(self, X: Any) -> NDArray[Any]:
+    def predict(self, X: ArrayLike) -> Array:
         """Most probable label of each sample."""
         best = self.predict_proba(X).argmax(-1)
-        labels: NDArray[Any] = self.classes_[best]
-        return labels
+        return np.asarray(self.classes_[best])
 
 
-def _is_unlabelled(y: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_unlabelled(y: Array) -> Array:
     """Where a label is the number -1."""
     if y.dtype.kind in "iuf":
         return np.asarray(y == UNLABELLED)
@@ -358,13 +318,9 @@ def _is_unlabelled(y: NDArray[Any]) -> NDArray[np.bool_]:
     return np.zeros(len(y), dtype=bool)
 
 
-def _has_label(y: NDArray[Any]) -> NDArray[np.bool_]:
+def _has_label(y: Array) -> Array:
     """Where a sample has a label: everywhere if -1 and 1 are all that there is."""
     unlabelled = _is_unlabelled(y)
     if unlabelled.any() and not unlabelled.all() and set(y.tolist()) == {-1, 1}:
         return np.ones(len(y), dtype=bool)
     return ~unlabelled
-
-
-def _numpy_dtype(network: torch.nn.Module) -> type[np.floating[Any]]:
-    return np.float64 if next(network.parameters()).dtype == torch.float64 else np.float32

@@ -1,6 +1,6 @@
 """The restricted Boltzmann machine as a transformer."""
 
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -11,25 +11,25 @@ from sklearn.utils.validation import check_is_fitted
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
-from memcomp_lightning.defaults import BATCH_SIZE, CENTRING_RATE, LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
+from memcomp_lightning.data import Batches
+from memcomp_lightning.defaults import BATCH_SIZE, LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.estimators.base import (
     MemcompEstimator,
-    Patience,
+    RandomState,
     array_of,
     dbn_for,
     in_precision_of,
     seed_of,
-    sgd,
 )
 from memcomp_lightning.estimators.inputs import (
+    Array,
     Matrix,
-    Scaling,
+    Samples,
     batches_of,
     dense_parts,
     hidden_means,
     log_odds_of,
-    weights_of,
 )
 from memcomp_lightning.likelihood import (
     Ais,
@@ -40,8 +40,7 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.models import RBM
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.objective import Centring
-from memcomp_lightning.samplers import PCD
+from memcomp_lightning.samplers import PCD, NegativePhaseSampler
 from memcomp_lightning.training import Greedy, PhaseTraining, require_finite
 
 MOST_ENUMERATED = 20
@@ -87,11 +86,14 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
     (4, 2)
     """
 
+    rbm_: RBM
+    _training: PhaseTraining
+
     def __init__(
         self,
         n_components: int = 64,
         *,
-        sampler: Any = None,
+        sampler: NegativePhaseSampler[Any, Any] | None = None,
         learning_rate: float = LEARNING_RATE,
         batch_size: int | None = BATCH_SIZE,
         n_iter: int = PASSES,
@@ -101,7 +103,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         n_iter_no_change: int = 10,
         tol: float = 1e-4,
         verbose: bool = False,
-        random_state: Any = None,
+        random_state: RandomState = None,
     ) -> None:
         self.n_components = n_components
         self.sampler = sampler
@@ -119,7 +121,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
     def _default_sampler(self) -> PCD:
         return PCD(n_chains=N_CHAINS)
 
-    def fit(self, X: Any, y: Any = None, sample_weight: ArrayLike | None = None) -> "MemcompRBM":
+    def fit(self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None) -> Self:
         """Train from new weights.
 
         Args:
@@ -132,38 +134,20 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             DivergedError: A parameter left the finite numbers.
         """
         self._check_settings()
-        X = self._read(X, reset=True)
-        weight = weights_of(sample_weight, X)
-        if weight is not None:
-            X, weight = X[weight > 0], weight[weight > 0]
+        samples = self._read_samples(X, sample_weight, reset=True)
         seed = seed_of(self.random_state)
-        self._scaling = Scaling.of(X)
-        X = self._scaling.apply(X)
-        held_out, held_out_weight = None, None
+        samples, held_out = self._scaled(samples, begins=True), None
         if self.early_stopping:
             rows, others = train_test_split(
-                np.arange(X.shape[0]), test_size=self.validation_fraction, random_state=seed
+                np.arange(samples.X.shape[0]), test_size=self.validation_fraction, random_state=seed
             )
-            held_out, held_out_weight = X[others], None if weight is None else weight[others]
-            X, weight = X[rows], None if weight is None else weight[rows]
+            samples, held_out = samples.take(rows), samples.take(others)
         with on_the_cpu():
-            self._begin(X, weight, seed)
-            patience = Patience(self.rbm_, tol=self.tol, n_iter_no_change=self.n_iter_no_change)
-            batches = self._batches(X, weight)
-            for _ in range(self.n_iter):
-                self._run_pass(batches)
-                score = None
-                if held_out is not None:
-                    score = float(np.average(self._pseudo_likelihood(held_out), weights=held_out_weight))
-                self._say(self.n_iter_, self.n_iter, score)
-                if score is not None and patience.ends_with(score):
-                    break
-            if held_out is not None:
-                patience.restore()
-        self.validation_scores_ = patience.scores if self.early_stopping else None
+            self._begin(samples, seed)
+            self._run_passes(self.rbm_, samples, held_out)
         return self
 
-    def partial_fit(self, X: Any, y: Any = None, sample_weight: ArrayLike | None = None) -> "MemcompRBM":
+    def partial_fit(self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None) -> Self:
         """Do one pass over these samples; chains, centres and optimiser go on from the last call, or from ``fit``.
 
         The first call draws the weights and settles scaling and first biases by its samples. Arguments and errors
@@ -172,97 +156,75 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         self._check_settings()
         self._refuse_early_stopping()
         begins = not hasattr(self, "rbm_")
-        X = self._read(X, reset=begins)
-        weight = weights_of(sample_weight, X)
-        if weight is not None:
-            X, weight = X[weight > 0], weight[weight > 0]
-        if begins:
-            self._scaling = Scaling.of(X)
-        X = self._scaling.apply(X)
+        samples = self._scaled(self._read_samples(X, sample_weight, reset=begins), begins=begins)
         with on_the_cpu():
             if begins:
-                self._begin(X, weight, seed_of(self.random_state))
-            training = self._training
-            for group in training.optimizer.param_groups:
-                group["lr"] = self.learning_rate
-            training.go_on_with(self._negative_phase(), self._centring())
-            # Data of another precision than the model's take the model's.
-            X = X.astype(self.components_.dtype, copy=False)
-            weight = None if weight is None else weight.astype(X.dtype)
-            self._run_pass(self._batches(X, weight))
-        self.validation_scores_ = None
+                self._begin(samples, seed_of(self.random_state))
+            self._training.go_on_with(self._negative_phase(), self._centring())
+            self._go_on(self.rbm_, samples)
         return self
 
     def _check_settings(self) -> None:
         require_count("n_components", self.n_components)
-        require_count("n_iter", self.n_iter)
-        if self.batch_size is not None:
-            require_count("batch_size", self.batch_size)
-        sgd(self.learning_rate)
-        self._check_early_stopping()
+        super()._check_settings()
 
-    def _negative_phase(self) -> Any:
-        return self._default_sampler() if self.sampler is None else self.sampler
+    def _read_samples(self, X: ArrayLike, sample_weight: ArrayLike | None, *, reset: bool) -> Samples:
+        data = self._read(X, reset=reset)
+        return Samples.that_count(data, np.zeros(data.shape[0], dtype=np.int64), sample_weight)
 
-    def _centring(self) -> Centring | None:
-        return Centring(rate=CENTRING_RATE) if self.centred else None
-
-    def _begin(self, X: Matrix, weight: NDArray[Any] | None, seed: int) -> None:
-        dbn = dbn_for(X, [int(self.n_components)], std=WEIGHT_STD, generator=rng.stream(seed, "weights"))
+    def _begin(self, samples: Samples, seed: int) -> None:
+        dbn = dbn_for(samples.X, [int(self.n_components)], std=WEIGHT_STD, generator=rng.stream(seed, "weights"))
         rbm = dbn[0]
-        self._base = torch.from_numpy(log_odds_of(X, weight)).to(rbm.b)
+        self._base = log_odds_of(samples).to(rbm.b)
         rbm.b.data.copy_(self._base)
         self.rbm_, self.n_iter_, self._seed = rbm, 0, seed
         self._training = PhaseTraining(
             Greedy(dbn).phases[0],
             self._negative_phase(),
-            optimizer=sgd(self.learning_rate),
+            optimizer=self._optimizer(),
             centring=self._centring(),
             streams=rng.streams(seed, ("negative_phase", "positive_phase")),
         )
         self._gibbs_generator = rng.stream(seed, "gibbs")
 
-    def _batches(self, X: Matrix, weight: NDArray[Any] | None) -> Any:
+    def _batches(self, samples: Samples) -> Batches:
         sampler = self._negative_phase()
-        return batches_of(X, None, weight, batch_size=self.batch_size, sampler=sampler, seed=self._seed)
+        return batches_of(samples, batch_size=self.batch_size, sampler=sampler, seed=self._seed)
 
-    def _run_pass(self, batches: Any) -> None:
-        batches.set_epoch(self.n_iter_)
-        self._training.run_pass(batches)
+    def _run_pass(self, batches: Batches) -> None:
+        super()._run_pass(batches)
         require_finite(self.rbm_, "pretraining")
-        self.n_iter_ += 1
+
+    def _score_held_out(self, samples: Samples) -> float:
+        return float(np.average(self._pseudo_likelihood(samples.X), weights=samples.weight))
 
     @property
-    def components_(self) -> NDArray[Any]:
+    def components_(self) -> Array:
         """Weights, ``(n_components, n_features)``."""
-        return self._parameter("weight")
+        return self.rbm_.weight.detach().numpy()
 
     @property
-    def intercept_hidden_(self) -> NDArray[Any]:
+    def intercept_hidden_(self) -> Array:
         """Hidden biases, ``(n_components,)``."""
-        return self._parameter("c")
+        return self.rbm_.c.detach().numpy()
 
     @property
-    def intercept_visible_(self) -> NDArray[Any]:
+    def intercept_visible_(self) -> Array:
         """Visible biases, ``(n_features,)``."""
-        return self._parameter("b")
-
-    def _parameter(self, name: str) -> NDArray[Any]:
-        values: NDArray[Any] = getattr(self.rbm_, name).detach().numpy()
-        return values
+        return self.rbm_.b.detach().numpy()
 
     @property
     def _n_features_out(self) -> int:
         return self.rbm_.n_hidden
 
-    def transform(self, X: Any) -> NDArray[Any]:
+    def transform(self, X: ArrayLike) -> Array:
         """Hidden means given the data, ``(n_samples, n_components)``, in the precision of X."""
         X = self._checked(X)
         with on_the_cpu(), torch.no_grad():
             data, rbm = in_precision_of(X, self.rbm_)
             return array_of(hidden_means(rbm, data), like=X)
 
-    def gibbs(self, v: Any) -> NDArray[Any]:
+    def gibbs(self, v: ArrayLike) -> Array:
         """One step of Gibbs sampling from each sample: hidden units given it, visible units given them.
 
         Every call draws on from the random stream that ``fit`` began.
@@ -277,7 +239,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             parts = [sweep(rbm, part, generator=self._gibbs_generator) for part in dense_parts(data)]
             return self._scaling.to_data(array_of(torch.cat(parts), like=X))
 
-    def sample(self, n_samples: int = 1, *, n_steps: int = 1000, random_state: Any = None) -> NDArray[Any]:
+    def sample(self, n_samples: int = 1, *, n_steps: int = 1000, random_state: RandomState = None) -> Array:
         """Draw samples from the model.
 
         They are exact and independent with up to 20 hidden units or features. Otherwise each is the end of a Gibbs
@@ -306,7 +268,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
                     v = sweep(self.rbm_, v, generator=generator)
             return self._scaling.to_data(v.numpy())
 
-    def score_samples(self, X: Any) -> NDArray[np.float64]:
+    def score_samples(self, X: ArrayLike) -> NDArray[np.float64]:
         """Log pseudo-likelihood of each sample in nats, features rounded to 0 or 1, ``(n_samples,)`` float64."""
         X = self._checked(X)
         with on_the_cpu():
@@ -316,11 +278,11 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         parts = [log_pseudo_likelihood(self.rbm_, part.round()).sum(-1) for part in dense_parts(X)]
         return torch.cat(parts).detach().numpy()
 
-    def score(self, X: Any, y: Any = None) -> float:
+    def score(self, X: ArrayLike, y: object = None) -> float:
         """Mean of :meth:`score_samples`: what a grid search maximises."""
         return float(self.score_samples(X).mean())
 
-    def log_likelihood(self, X: Any) -> NDArray[np.float64]:
+    def log_likelihood(self, X: ArrayLike) -> NDArray[np.float64]:
         """Log-likelihood of each sample in nats, features rounded to 0 or 1, ``(n_samples,)`` float64.
 
         Exact with up to 20 hidden units or features, otherwise by annealed importance sampling.
@@ -335,5 +297,4 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             return torch.cat(parts).detach().numpy()
 
     def _is_small(self) -> bool:
-        rbm: RBM = self.rbm_
-        return min(rbm.n_visible, rbm.n_hidden) <= MOST_ENUMERATED
+        return min(self.rbm_.n_visible, self.rbm_.n_hidden) <= MOST_ENUMERATED

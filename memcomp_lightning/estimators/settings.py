@@ -6,13 +6,18 @@ from typing import Any
 
 from sklearn.base import BaseEstimator
 
+from memcomp_lightning.samplers import NegativePhaseSampler
+
 
 class NestedSettings(BaseEstimator):  # type: ignore[misc]
     """An estimator whose samplers, and what is inside them, have names like ``sampler__inner__k``."""
 
     @abstractmethod
-    def _default_sampler(self) -> Any:
+    def _default_sampler(self) -> NegativePhaseSampler[Any, Any]:
         """What ``sampler=None`` stands for."""
+
+    def _negative_phase(self) -> NegativePhaseSampler[Any, Any]:
+        return self._default_sampler() if self.sampler is None else self.sampler
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
         """Return all settings; with ``deep`` those of the sampler as well, the default one where it is None."""
@@ -51,7 +56,7 @@ class NestedSettings(BaseEstimator):  # type: ignore[misc]
         return self._default_sampler() if name == "sampler" and value is None else value
 
 
-def _is_settings(value: Any) -> bool:
+def _is_settings(value: object) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
@@ -59,7 +64,7 @@ def _names(settings: Any) -> list[str]:
     return [field.name for field in dataclasses.fields(settings) if field.init]
 
 
-def _listed(prefix: str, value: Any) -> dict[str, Any]:
+def _listed(prefix: str, value: object) -> dict[str, Any]:
     if not _is_settings(value):
         return {}
     found: dict[str, Any] = {}

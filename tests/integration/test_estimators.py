@@ -342,7 +342,9 @@ def test_fractional_weights_keep_steps_even():
     X, _ = binary(30)
     weight = np.ones(30)
     weight[0] = 300.0
-    batches = list(inputs.batches_of(X, None, weight + 0.5, batch_size=10, seed=0))
+    batches = list(
+        inputs.batches_of(inputs.Samples(X, np.zeros(30, dtype=int), weight + 0.5), batch_size=10, seed=0)
+    )
     heavy = [
         float((b.weight * torch.from_numpy((b.v.numpy() == X[0]).all(1).astype(float))).sum()) for b in batches
     ]
