@@ -1,6 +1,7 @@
 """Callbacks that log, draw or guard training; :mod:`memcomp_lightning.callbacks.base` says what they need."""
 
 from memcomp_lightning.callbacks.best_weights import BestWeights
+from memcomp_lightning.callbacks.chain_pictures import ChainPictures
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
 from memcomp_lightning.callbacks.energy_histograms import EnergyHistograms
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
@@ -8,11 +9,12 @@ from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
 from memcomp_lightning.callbacks.log_likelihood import LogLikelihood
+from memcomp_lightning.callbacks.model_samples import ModelSamples
 from memcomp_lightning.callbacks.negative_phase import NegativePhaseEnergies
 from memcomp_lightning.callbacks.optimizer_monitor import OptimizerMonitor
-from memcomp_lightning.callbacks.pictures import ChainPictures, ModelSamples, ReceptiveFields
 from memcomp_lightning.callbacks.progress import StageProgressBar
-from memcomp_lightning.callbacks.reconstruction import ReconstructionError
+from memcomp_lightning.callbacks.receptive_fields import ReceptiveFields
+from memcomp_lightning.callbacks.reconstruction_error import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
 from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
 from memcomp_lightning.callbacks.schedules import Schedules

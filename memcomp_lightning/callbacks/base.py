@@ -1,15 +1,7 @@
 """What the callbacks ask of a LightningModule, and how they log.
 
-A module that trains an energy model offers all of these:
-
-* ``training_step`` returns a dictionary with ``positive`` and ``negative`` (:class:`Configurations`),
-  ``contrast`` ``(*replicas,)``, which is mean E(positive) - mean E(negative), and ``info`` (diagnostics of the
-  sampler); also with ``v``, the visible states of the images, if ``positive.v`` is something else.
-* ``validation_step`` returns a dictionary with ``v``, the visible states of held-out images.
-* Attributes: ``model``, the model in training.
-
-A module that trains a classifier returns ``score`` (:class:`memcomp_lightning.training.Score`) in the
-dictionaries of ``training_step``, ``validation_step`` and ``test_step``.
+The steps of a module return a dictionary: :class:`StepOutputs` says what callbacks look at, and each needs what it
+shows. A module that trains an energy model has it as the attribute ``model``.
 
 Optional attributes:
 
@@ -25,16 +17,55 @@ Optional attributes:
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Protocol, TypedDict, cast
 
 import lightning.pytorch as pl
+import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
-from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from torch import Tensor
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.plotting.rendering import rendered
+from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.training import Score
+from memcomp_lightning.types import Configurations
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
+
+class StepOutputs(TypedDict, total=False):
+    """What a step returns.
+
+    Attributes:
+        positive: Data with the hidden means given them; of ``training_step``.
+        negative: The negative phase; of ``training_step``.
+        contrast: mean E(positive) - mean E(negative), ``(*replicas,)``; of ``training_step``.
+        info: Diagnostics of the sampler; of ``training_step``, may be left out.
+        v: Visible states of held-out images, of ``validation_step``; of ``training_step`` those of its images, if
+            ``positive.v`` is something else.
+        score: Of a classifier; of all steps.
+    """
+
+    positive: Configurations
+    negative: Configurations
+    contrast: Tensor
+    info: dict[str, Tensor]
+    v: Tensor
+    score: Score
+
+
+class ShownModel(EnergyModel, Protocol):
+    """An energy model, with what callbacks need beyond training."""
+
+    def mean_energy(self, configurations: Configurations) -> Tensor:
+        """Weighted mean of E(v, h), ``(*replicas,)``."""
+        ...
+
+    def visible_mean(self, h: Tensor) -> Tensor:
+        """E[v | h]."""
+        ...
 
 
 def prefix_of(module: pl.LightningModule) -> str:
@@ -47,7 +78,7 @@ def iteration_of(module: pl.LightningModule) -> int:
     return int(getattr(module, "iteration", module.current_epoch))
 
 
-def model_of(module: pl.LightningModule) -> Any:
+def model_of(module: pl.LightningModule) -> ShownModel:
     """The energy model in training.
 
     Raises:
@@ -60,7 +91,7 @@ def model_of(module: pl.LightningModule) -> Any:
             f"{type(module).__name__} has {has}: this callback looks at the energy model in training; see "
             "memcomp_lightning.callbacks.base for the protocol."
         )
-    return model
+    return cast(ShownModel, model)
 
 
 def log_scalars(
@@ -90,18 +121,18 @@ def log_scalars(
     )
 
 
-def tensorboards(trainer: pl.Trainer) -> list[Any]:
+def tensorboards(trainer: pl.Trainer) -> "list[SummaryWriter]":
     """The summary writers of all TensorBoard loggers; empty on processes other than rank 0."""
     if not trainer.is_global_zero:
         return []
     return [logger.experiment for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
 
 
-def write_figure(trainer: pl.Trainer, module: pl.LightningModule, tag: str, figure: Figure) -> None:
-    """Write a figure to every TensorBoard logger."""
+def write_picture(trainer: pl.Trainer, module: pl.LightningModule, tag: str, picture: NDArray[np.generic]) -> None:
+    """Write a picture, ``(height, width)`` or ``(height, width, 3)``, to every TensorBoard logger."""
+    axes = "HW" if picture.ndim == 2 else "HWC"
     for board in tensorboards(trainer):
-        tag_of_stage = f"{prefix_of(module)}/{tag}"
-        board.add_image(tag_of_stage, rendered(figure), trainer.global_step, dataformats="HWC")
+        board.add_image(f"{prefix_of(module)}/{tag}", picture, trainer.global_step, dataformats=axes)
 
 
 def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_units: int) -> None:
@@ -160,7 +191,7 @@ class EveryIterations(pl.Callback, ABC):
     def __init__(self, every: int = 1) -> None:
         require_count("every", every)
         self.every = every
-        self._outputs: Mapping[str, Any] = {}
+        self._outputs: object = None
 
     def is_due(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> bool:
         """Whether the present pass is looked at."""
@@ -169,41 +200,40 @@ class EveryIterations(pl.Callback, ABC):
         return iteration % self.every == 0 or iteration + 1 == n_iterations
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Keep a reference to what ``training_step`` returned."""
         self._outputs = outputs
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Look, if it is time."""
-        outputs, self._outputs = self._outputs, {}
+        outputs, self._outputs = self._outputs, None
         if self.is_due(trainer, pl_module):
             with torch.no_grad():
                 self.look(trainer, pl_module, outputs)
 
     @abstractmethod
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """What a subclass does with the model and the outputs of the pass's last ``training_step``."""
 
 
-def images_of_step(outputs: Mapping[str, Any], callback: pl.Callback) -> Tensor:
+def images_of_step(outputs: object, callback: pl.Callback) -> Tensor:
     """Visible states of the images of a step: ``v``, or those of ``positive``."""
     if isinstance(outputs, Mapping) and "v" in outputs:
-        v: Tensor = outputs["v"]
-        return v
-    images: Tensor = required(outputs, "positive", callback).v
-    return images
+        return required(outputs, callback, "v")["v"]
+    return required(outputs, callback, "positive")["positive"].v
 
 
-def required(outputs: Mapping[str, Any], key: str, callback: pl.Callback) -> Any:
-    """Return ``outputs[key]``.
+def required(outputs: object, callback: pl.Callback, *keys: str) -> StepOutputs:
+    """Return what a step returned.
 
     Raises:
-        TypeError: ``training_step`` or ``validation_step`` does not return it.
+        TypeError: It is no dictionary, or lacks one of the keys.
     """
-    if not isinstance(outputs, Mapping) or key not in outputs:
-        raise TypeError(
-            f"{type(callback).__name__} needs {key!r} in the dictionary that the module's step returns; see "
-            "memcomp_lightning.callbacks.base for the protocol."
-        )
-    return outputs[key]
+    for key in keys:
+        if not isinstance(outputs, Mapping) or key not in outputs:
+            raise TypeError(
+                f"{type(callback).__name__} needs {key!r} in the dictionary that the module's step returns; see "
+                "memcomp_lightning.callbacks.base for the protocol."
+            )
+    return cast(StepOutputs, outputs)

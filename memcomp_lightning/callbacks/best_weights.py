@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import required
-from memcomp_lightning.training import BestPass
+from memcomp_lightning.training import BestPass, Score
 
 
 class BestWeights(pl.Callback):
@@ -21,23 +21,17 @@ class BestWeights(pl.Callback):
 
     def __init__(self) -> None:
         self._best = BestPass()
-        self._score: Any = None
+        self._score: Score | None = None
 
-    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_validation_epoch_start(self, *_: object) -> None:
         """Start a new sum."""
         self._score = None
 
     def on_validation_batch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Add a batch."""
-        score = required(outputs, "score", self)
+        score = required(outputs, self, "score")["score"]
         self._score = score if self._score is None else self._score + score
 
     @torch.no_grad()

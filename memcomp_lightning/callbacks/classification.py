@@ -1,10 +1,9 @@
 """Loss and accuracy of supervised training."""
 
-from typing import Any
-
 import lightning.pytorch as pl
 
 from memcomp_lightning.callbacks.base import log_scalars, required
+from memcomp_lightning.training import Score
 
 
 class ClassificationMetrics(pl.Callback):
@@ -20,10 +19,10 @@ class ClassificationMetrics(pl.Callback):
     """
 
     def __init__(self) -> None:
-        self.latest: dict[str, Any] = {}
+        self.latest: dict[str, Score] = {}
 
-    def _add(self, kind: str, outputs: Any) -> None:
-        score = required(outputs, "score", self)
+    def _add(self, kind: str, outputs: object) -> None:
+        score = required(outputs, self, "score")["score"]
         self.latest[kind] = self.latest[kind] + score if kind in self.latest else score
 
     def _log(self, kind: str, pl_module: pl.LightningModule) -> None:
@@ -31,12 +30,12 @@ class ClassificationMetrics(pl.Callback):
             score, tag = self.latest[kind], "" if kind == "train" else f"{kind}_"
             log_scalars(pl_module, {f"{tag}loss": score.mean_loss, f"{tag}accuracy": score.accuracy})
 
-    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_train_epoch_start(self, *_: object) -> None:
         """Start a new sum."""
         self.latest.pop("train", None)
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Add a batch."""
         self._add("train", outputs)
@@ -45,18 +44,12 @@ class ClassificationMetrics(pl.Callback):
         """Log the pass; the network changed while it was summed up."""
         self._log("train", pl_module)
 
-    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_validation_epoch_start(self, *_: object) -> None:
         """Start a new sum."""
         self.latest.pop("heldout", None)
 
     def on_validation_batch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Add a batch."""
         self._add("heldout", outputs)
@@ -65,18 +58,12 @@ class ClassificationMetrics(pl.Callback):
         """Log the held-out images."""
         self._log("heldout", pl_module)
 
-    def on_test_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_test_epoch_start(self, *_: object) -> None:
         """Start a new sum."""
         self.latest.pop("test", None)
 
     def on_test_batch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Add a batch."""
         self._add("test", outputs)

@@ -1,11 +1,7 @@
 """Energies of the data against those of the negative phase, as distributions."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import lightning.pytorch as pl
 import numpy as np
-from torch import Tensor
 
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
@@ -13,11 +9,12 @@ from memcomp_lightning.callbacks.base import (
     prefix_of,
     required,
     tensorboards,
-    write_figure,
+    write_picture,
 )
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import shares
 from memcomp_lightning.plotting.histograms import plot_histograms
+from memcomp_lightning.plotting.rendering import rendered
 
 
 class EnergyHistograms(EveryIterations):
@@ -38,17 +35,17 @@ class EnergyHistograms(EveryIterations):
         require_count("n_bins", n_bins)
         self.n_bins = n_bins
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Histograms of the last batch of the pass."""
         boards = tensorboards(trainer)
         if not boards:
             return
         model = model_of(pl_module)
+        step = required(outputs, self, "positive", "negative")
         energies, weights = {}, {}
-        for name, phase in (("data", "positive"), ("model", "negative")):
-            configurations = required(outputs, phase, self)
-            share: Tensor = shares(configurations).double().flatten().cpu()
-            energy: Tensor = model.energy(configurations.v, configurations.h).double().flatten().cpu()
+        for name, configurations in (("data", step["positive"]), ("model", step["negative"])):
+            share = shares(configurations).double().flatten().cpu()
+            energy = model.energy(configurations.v, configurations.h).double().flatten().cpu()
             energies[name] = energy[share > 0].numpy()
             weights[name] = share[share > 0].numpy() * configurations.v.shape[-2]
         everything = np.concatenate([*energies.values()])
@@ -70,4 +67,5 @@ class EnergyHistograms(EveryIterations):
                     bucket_counts=counts[name].tolist(),
                     global_step=trainer.global_step,
                 )
-        write_figure(trainer, pl_module, "energies", plot_histograms(edges, counts, xlabel="energy E(v, h)"))
+        figure = plot_histograms(edges, counts, xlabel="energy E(v, h)")
+        write_picture(trainer, pl_module, "energies", rendered(figure))

@@ -1,7 +1,5 @@
 """Free energy of training against held-out images: the overfitting monitor."""
 
-from typing import Any
-
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
@@ -28,33 +26,27 @@ class FreeEnergyGap(pl.Callback):
         self._train = LastImages(n_images)
         self._heldout: list[tuple[Tensor, int]] = []
 
-    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
         self._train.clear()
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Keep the visible states of the last batches, as many as asked for."""
         self._train.add(images_of_step(outputs, self))
 
-    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_validation_epoch_start(self, *_: object) -> None:
         """Start a new mean."""
         self._heldout = []
 
     def on_validation_batch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Free energy of one chunk of held-out images, until there are enough."""
         missing = self.n_images - sum(n for _, n in self._heldout)
         if missing > 0:
-            v = required(outputs, "v", self)[..., :missing, :]
+            v = required(outputs, self, "v")["v"][..., :missing, :]
             self._heldout.append((_free_energy(pl_module, v).sum(-1), v.shape[-2]))
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -72,5 +64,4 @@ class FreeEnergyGap(pl.Callback):
 
 @torch.no_grad()
 def _free_energy(module: pl.LightningModule, v: Tensor) -> Tensor:
-    free_energy: Tensor = model_of(module).free_energy(v)
-    return free_energy
+    return model_of(module).free_energy(v)

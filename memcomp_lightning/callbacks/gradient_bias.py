@@ -1,21 +1,14 @@
 """How far the sampler's gradient is from the exact one."""
 
 import copy
-from collections.abc import Mapping
-from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import (
-    EveryIterations,
-    log_scalars,
-    model_of,
-    require_enumerable,
-    required,
-)
+from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, require_enumerable, required
+from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import Exact
 from memcomp_lightning.types import Configurations, NoState
@@ -46,25 +39,24 @@ class GradientBias(EveryIterations):
 
     def __init__(self, every: int = 20) -> None:
         super().__init__(every)
-        self._before: Any = None
+        self._before: EnergyModel | None = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Refuse models too large to enumerate."""
         require_enumerable(self, pl_module, MAX_UNITS)
 
-    def on_train_batch_start(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: object) -> None:
         """Keep the model as the sampler meets it."""
         if trainer.is_last_batch and self.is_due(trainer, pl_module):
             self._before = copy.deepcopy(model_of(pl_module))
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Compare both gradients."""
         model, self._before = self._before, None
         if model is None:
             return
-        positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
+        step = required(outputs, self, "positive", "negative")
+        positive, negative = step["positive"], step["negative"]
         # Enumeration draws nothing; the protocol of samplers asks for a stream.
         generator = rng.stream(0, "gradient_bias")
         exact = Exact(max_units=MAX_UNITS).sample(model, NoState(), positive, generator=generator).configurations
@@ -77,7 +69,7 @@ def compared(found: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cosine_similarity(found, wanted, dim=-1), (found - wanted).norm(dim=-1) / wanted.norm(dim=-1)
 
 
-def gradient(model: Any, positive: Configurations, negative: Configurations) -> Tensor:
+def gradient(model: EnergyModel, positive: Configurations, negative: Configurations) -> Tensor:
     """Gradient of the contrast by all parameters end to end, ``(*replicas, n_parameters)``."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     with torch.enable_grad():

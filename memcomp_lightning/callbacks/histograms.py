@@ -1,9 +1,7 @@
 """Histograms of weights and biases."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import lightning.pytorch as pl
+from torch import nn
 
 from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, tensorboards
 
@@ -18,9 +16,9 @@ class ParameterHistograms(EveryIterations):
     def __init__(self, every: int = 10) -> None:
         super().__init__(every)
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Parameters of the model in training, or of the whole module."""
-        model: Any = getattr(pl_module, "model", pl_module)
+        model: nn.Module = getattr(pl_module, "model", pl_module)
         for board in tensorboards(trainer):
             for name, parameter in model.named_parameters():
                 if not parameter.numel():  # biases of no hidden units

@@ -1,7 +1,6 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
 import math
-from collections.abc import Mapping
 from typing import Any, Literal, TypedDict
 
 import lightning.pytorch as pl
@@ -20,6 +19,7 @@ from memcomp_lightning.callbacks.base import (
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.models import EnergyModel
 
 QUICKLY_ENUMERATED = 16
 """Units that "auto" enumerates at most."""
@@ -113,16 +113,16 @@ class LogLikelihood(EveryIterations):
         if self.method == "exact":
             require_enumerable(self, pl_module, self.max_units)
 
-    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
         self._train.clear()
         self._heldout = []
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Keep the visible states of the last batches."""
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        super().on_train_batch_end(trainer, pl_module, outputs)
         if self._looks(trainer, pl_module):
             self._train.add(images_of_step(outputs, self))
 
@@ -134,20 +134,14 @@ class LogLikelihood(EveryIterations):
 
     @torch.no_grad()
     def on_validation_batch_end(
-        self,
-        trainer: pl.Trainer,
-        pl_module: pl.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Unnormalised log-likelihood of one chunk of held-out images."""
         if self._looks(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
-            v = required(outputs, "v", self)
+            v = required(outputs, self, "v")["v"]
             self._heldout.append((self._total(model_of(pl_module), v, self._bits), v.shape[-2]))
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Normalise."""
         model = model_of(pl_module)
         method = self._method_for(model)
@@ -160,7 +154,8 @@ class LogLikelihood(EveryIterations):
             total = self._total(model, train, rng.stream(self.seed, "log_likelihood", 0))
             values["log_likelihood_train"] = total / train.shape[-2] - log_z
         # A validation in the middle of the pass has judged another model.
-        if self._heldout and self._judged_at == trainer.global_step:
+        judged = bool(self._heldout) and self._judged_at == trainer.global_step
+        if judged:
             n_images = sum(n for _, n in self._heldout)
             values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
         log_scalars(pl_module, values)
@@ -169,8 +164,8 @@ class LogLikelihood(EveryIterations):
                 layer=int(getattr(pl_module, "layer", 0)),
                 iteration=iteration_of(pl_module) + 1,
                 method=method,
-                train=_numbers(values.get("log_likelihood_train")),
-                heldout=_numbers(values.get("log_likelihood_heldout")),
+                train=values["log_likelihood_train"].flatten().tolist() if train is not None else [],
+                heldout=values["log_likelihood_heldout"].flatten().tolist() if judged else [],
             )
         )
 
@@ -186,7 +181,7 @@ class LogLikelihood(EveryIterations):
         """Whether the present pass ends with a value."""
         return self.is_due(trainer, module) and self._method_for(model_of(module)) is not None
 
-    def _method_for(self, model: Any) -> Literal["exact", "ais"] | None:
+    def _method_for(self, model: EnergyModel) -> Literal["exact", "ais"] | None:
         """How log Z of a model is found; None if it is not."""
         if self.method != "auto":
             return self.method
@@ -196,7 +191,7 @@ class LogLikelihood(EveryIterations):
         n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
         return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
 
-    def _partition_function(self, model: Any, method: str, train: Tensor | None) -> dict[str, Tensor]:
+    def _partition_function(self, model: EnergyModel, method: str, train: Tensor | None) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
         if method == "exact":
             return {"log_z": likelihood.log_partition_function(model, max_units=self.max_units)}
@@ -210,13 +205,8 @@ class LogLikelihood(EveryIterations):
         }
 
     @staticmethod
-    def _total(model: Any, v: Tensor, bits: Generator) -> Tensor:
+    def _total(model: EnergyModel, v: Tensor, bits: Generator) -> Tensor:
         """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
         log_z = v.new_zeros(model.replicas, dtype=torch.float64)
         v = rng.bernoulli(v, generator=bits)
         return likelihood.log_likelihood_or_bound(model, v, log_z).double().sum(-1)
-
-
-def _numbers(values: Tensor | None) -> list[float]:
-    """One number a replica."""
-    return [] if values is None else [float(value) for value in values.flatten()]

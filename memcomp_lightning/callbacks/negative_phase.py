@@ -1,8 +1,5 @@
 """Energies of the two phases."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import lightning.pytorch as pl
 
 from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, required
@@ -19,16 +16,17 @@ class NegativePhaseEnergies(EveryIterations):
         every: Passes between two values, >= 1.
     """
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Energies of the last batch of the pass."""
         model = model_of(pl_module)
-        positive, negative = required(outputs, "positive", self), required(outputs, "negative", self)
+        step = required(outputs, self, "positive", "negative", "contrast")
+        positive, negative = step["positive"], step["negative"]
         log_scalars(
             pl_module,
             {
                 "energy_data": model.energy(positive.v, positive.h).mean(-1),
                 "energy_model": model.mean_energy(negative),
                 "energy_model_lowest": model.energy(negative.v, negative.h).min(-1).values,
-                "contrast": required(outputs, "contrast", self),
+                "contrast": step["contrast"],
             },
         )

@@ -1,7 +1,6 @@
 """A progress bar that says where training is."""
 
 import sys
-from typing import Any
 
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import ProgressBar
@@ -31,7 +30,7 @@ class StageProgressBar(ProgressBar):
     ) -> None:
         super().__init__()
         self.metrics = tuple(metrics)
-        self._bar: Any = None
+        self._bar = tqdm(disable=True)
         self._enabled = True
 
     def disable(self) -> None:
@@ -55,7 +54,7 @@ class StageProgressBar(ProgressBar):
         )
         self._describe(pl_module)
 
-    def on_train_epoch_start(self, trainer: pl.Trainer, *_: Any) -> None:
+    def on_train_epoch_start(self, trainer: pl.Trainer, *_: object) -> None:
         """Say where training is."""
         self._describe(trainer.lightning_module)
 
@@ -76,13 +75,8 @@ class StageProgressBar(ProgressBar):
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Close the bar."""
-        self._close()
+        self._bar.close()
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
         """Close the bar."""
-        self._close()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+        self._bar.close()

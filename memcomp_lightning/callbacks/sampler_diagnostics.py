@@ -1,6 +1,5 @@
 """What the sampler reports, and how well its chains mix."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import lightning.pytorch as pl
@@ -40,10 +39,10 @@ class SamplerDiagnostics(EveryIterations):
         self._energies: list[Tensor] = []
         self._v: Tensor | None = None
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Report, and add to the series."""
-        negative = required(outputs, "negative", self)
-        values = {**outputs.get("info", {}), **self._mixing(pl_module, negative)}
+        step = required(outputs, self, "negative")
+        values = {**step.get("info", {}), **self._mixing(pl_module, step["negative"])}
         # What a sampler reports may depend on a draw of its process (mode-assisted training tosses a coin).
         tagged = {f"negative_phase/{key}": value for key, value in values.items()}
         log_scalars(pl_module, tagged, of_first_process=True)
@@ -111,7 +110,7 @@ def _chains_persist(module: pl.LightningModule) -> bool:
     return _holds_chains(init(model, 1, generator=rng.stream(0, "check")), widths)
 
 
-def _holds_chains(state: Any, widths: tuple[int, ...]) -> bool:
+def _holds_chains(state: object, widths: tuple[int, ...]) -> bool:
     """Whether a sampler's state, or one in it, holds states of the visible units or of all."""
     if isinstance(state, Tensor):
         return state.ndim >= 2 and state.shape[-1] in widths

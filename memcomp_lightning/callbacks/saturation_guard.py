@@ -63,7 +63,7 @@ class SaturationGuard(pl.Callback):
             self._keep(pl_module, f"from before pass {iteration_of(pl_module) + 1} of {prefix_of(pl_module)}")
 
     def on_train_batch_end(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
         """Judge the pass after its last update.
 
@@ -95,7 +95,7 @@ class SaturationGuard(pl.Callback):
             log.warning(self._save(trainer))
 
     @staticmethod
-    def _stuck(trainer: pl.Trainer, outputs: Any) -> float:
+    def _stuck(trainer: pl.Trainer, outputs: object) -> float:
         """Share of saturated hidden means in the worst replica, the same in every process."""
         positive = outputs.get("positive") if isinstance(outputs, dict) else None
         if positive is None or not positive.h.numel():

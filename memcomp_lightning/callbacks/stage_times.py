@@ -45,19 +45,19 @@ class StageTimes(pl.Callback):
         self._add("other_s")
         self._stage = prefix_of(pl_module)
 
-    def on_train_batch_start(self, *_: Any) -> None:
+    def on_train_batch_start(self, *_: object) -> None:
         """A training step begins."""
         self._add("other_s")
 
-    def on_train_batch_end(self, *_: Any) -> None:
+    def on_train_batch_end(self, *_: object) -> None:
         """A training step is done."""
         self._add("training_s")
 
-    def on_validation_batch_start(self, *_: Any) -> None:
+    def on_validation_batch_start(self, *_: object) -> None:
         """A validation step begins."""
         self._add("other_s")
 
-    def on_validation_batch_end(self, *_: Any) -> None:
+    def on_validation_batch_end(self, *_: object) -> None:
         """A validation step is done."""
         self._add("validation_s")
 

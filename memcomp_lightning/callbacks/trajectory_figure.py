@@ -1,14 +1,12 @@
 """The path of a memcomputing machine that solves the model in training, as a figure in TensorBoard."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks.base import EveryIterations, model_of, tensorboards, write_figure
+from memcomp_lightning.callbacks.base import EveryIterations, model_of, tensorboards, write_picture
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.plotting.rendering import rendered
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.solvers import QuboSolver
@@ -46,7 +44,7 @@ class TrajectoryFigure(EveryIterations):
         self.last = last
         self.seed = seed
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Solve, and draw."""
         if not tensorboards(trainer):
             return
@@ -55,9 +53,8 @@ class TrajectoryFigure(EveryIterations):
         if not isinstance(solution.trajectory, Trajectory):
             raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")
         title = f"lowest energy {solution.best_energy.item():.4g}"
-        write_figure(
-            trainer, pl_module, "trajectory", plot_trajectory(solution.trajectory, last=self.last, title=title)
-        )
+        figure = plot_trajectory(solution.trajectory, last=self.last, title=title)
+        write_picture(trainer, pl_module, "trajectory", rendered(figure))
 
 
 def _first(problem: Qubo) -> Qubo:

@@ -1,8 +1,5 @@
 """How well one up-and-down pass brings the data back."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import lightning.pytorch as pl
 
 from memcomp_lightning.callbacks.base import EveryIterations, images_of_step, log_scalars, model_of
@@ -17,7 +14,7 @@ class ReconstructionError(EveryIterations):
         every: Passes between two values, >= 1.
     """
 
-    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Mapping[str, Any]) -> None:
+    def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Reconstruct the last batch of the pass."""
         v = images_of_step(outputs, self)
         model = model_of(pl_module)
