@@ -1,7 +1,6 @@
 """Supervised training of any network on the replica axis."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -57,7 +56,7 @@ class Classifier(StageModule):
         return self.make_optimizer(self.network.parameters())
 
     @with_gradient()
-    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the mean loss; replicas add up and stay independent.
 
         Returns:
@@ -69,10 +68,10 @@ class Classifier(StageModule):
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": score(logits, batch.label, self.loss)}
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of held-out images."""
         return {"score": score(self(batch.v), batch.label, self.loss)}
 
-    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of test images."""
         return self.validation_step(batch, batch_idx)

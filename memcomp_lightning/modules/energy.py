@@ -20,7 +20,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.objective import Centring, Offsets, weighted
-from memcomp_lightning.samplers import NegativePhaseSampler, tensors_of, with_tensors
+from memcomp_lightning.samplers import tensors_of, with_tensors
 from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.training import (
     PRETRAINING_SGD,
@@ -28,6 +28,8 @@ from memcomp_lightning.training import (
     OptimizerFactory,
     Phase,
     PretrainingStage,
+    Processes,
+    Sampler,
     Schedule,
     StepState,
 )
@@ -68,7 +70,7 @@ class EnergyPretraining(StageModule):
     def __init__(
         self,
         pretraining: PretrainingStage,
-        sampler: NegativePhaseSampler[Any, Any],
+        sampler: Sampler,
         *,
         iterations: int = defaults.PASSES,
         optimizer: OptimizerFactory = PRETRAINING_SGD,
@@ -83,7 +85,7 @@ class EnergyPretraining(StageModule):
         self.pretraining = pretraining
         self.network = pretraining.network
         known = set(self.network.modules())
-        self.models_beside_network = nn.ModuleList(model for model in self.models if model not in known)
+        self.models_beside_network = nn.ModuleList(m for m in cast(list[nn.Module], self.models) if m not in known)
         self.sampler = sampler
         self.centring = centring
         self.energy_gaps: list[Tensor] = []
@@ -102,13 +104,13 @@ class EnergyPretraining(StageModule):
         """Models that are trained, one for each phase."""
         return len(self.phases)
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """What the stage did, as plain values, with the energy gaps and the names of the models."""
         gaps = [gap.reshape(-1).tolist() for gap in self.energy_gaps]
         return {**super().record(), "energy_gap": gaps, "trained": [phase.name for phase in self.phases]}
 
     @property
-    def models(self) -> list[Any]:
+    def models(self) -> list[EnergyModel]:
         """All energy models that are trained, in order."""
         return [phase.model for phase in self.phases]
 
@@ -238,7 +240,7 @@ class EnergyPretraining(StageModule):
         return re.sub(rf"^{self.stage}/({tags})/", f"{self.log_prefix}/", name) if tags else name
 
     @with_gradient()
-    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases.
 
         Returns:
@@ -250,7 +252,7 @@ class EnergyPretraining(StageModule):
             v = self.phase.visible_of(batch.v)
             positive, inferred = self.phase.positive(v, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
-        processes = _OfTrainer(self.trainer, self.device)
+        processes = _OfTrainer(self.trainer, self.device) if self.trainer.world_size > 1 else Processes()
         step = EnergyStep(sampler=self.sampler, centring=self.centring, processes=processes)
         generator = self.streams["negative_phase"]
         gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
@@ -310,24 +312,19 @@ class EnergyPretraining(StageModule):
             self._state = self._state._replace(sampler=with_tensors(template, chains))
 
 
-class _OfTrainer:
-    """The processes of a trainer."""
+class _OfTrainer(Processes):
+    """The processes of a trainer that has several."""
 
     def __init__(self, trainer: pl.Trainer, device: torch.device) -> None:
         self._trainer, self._device = trainer, device
 
     def mean(self, value: Tensor) -> Tensor:
-        """The mean over all of them."""
-        if self._trainer.world_size == 1:
-            return value
         return cast(Tensor, self._trainer.strategy.reduce(value, reduce_op="mean"))
 
-    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
+    def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
         """Call ``make`` in the process of rank 0 alone, and return its result in all of them."""
-        if self._trainer.world_size == 1:
-            return make()
         made = make() if self._trainer.is_global_zero else None
         made = self._trainer.strategy.broadcast(move_data_to_device(made, "cpu"))
         if made is None:
             raise RuntimeError("the process of rank 0 sent no negative phase")
-        return cast(NegativePhase[Any], move_data_to_device(made, self._device))
+        return cast(NegativePhase[object], move_data_to_device(made, self._device))

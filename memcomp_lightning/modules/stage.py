@@ -96,7 +96,7 @@ class StageModule(pl.LightningModule):
         """Models that the stage trains one after the other."""
         return 1
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """What the stage did, as plain values for the record of its run."""
         return {"iterations": self.iterations, "passes": self.passes, "wall_time_s": self.wall_time_s}
 
@@ -152,7 +152,7 @@ class StageModule(pl.LightningModule):
                 f"({self.stage}.optimizer.lr) and start a new run."
             )
 
-    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(self, *_: object) -> None:
         """Keep a wish to stop until the end of the pass."""
         self._keep_wish()
 

@@ -15,7 +15,7 @@ from memcomp_lightning.training.schedules import (
 )
 from memcomp_lightning.training.score import Score, evaluate, score
 from memcomp_lightning.training.stages import Boltzmann, Greedy, Joint, Phase, PretrainingStage
-from memcomp_lightning.training.step import EnergyStep, Processes, StepState
+from memcomp_lightning.training.step import EnergyStep, Processes, Sampler, StepState
 
 __all__ = [
     "FINETUNING_SGD",
@@ -39,6 +39,7 @@ __all__ = [
     "PhaseTraining",
     "PretrainingStage",
     "Processes",
+    "Sampler",
     "Schedule",
     "Score",
     "StepState",

@@ -8,7 +8,7 @@ in half the time or less. All others get it by autograd.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -40,7 +40,7 @@ class ClassifierStep:
         if self._closed_form is None:
             self._by_autograd(batch)[0].backward()
             return
-        for parameter, gradient in self._closed_form(batch).gradients:
+        for parameter, gradient in self._closed_form(batch)[1]:
             parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -63,17 +63,21 @@ def _total(losses: Tensor, batch: Batch) -> Tensor:
     return losses.sum() * share if isinstance(share, float) else (losses * share.squeeze(-2)).sum()
 
 
+class _Known(Protocol):
+    gradients: Sequence[Tensor]
+
+
 class _WithGradient(torch.autograd.Function):
     """A number whose gradient by some parameters is known already."""
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor, gradients: Sequence[Tensor], *parameters: Parameter) -> Tensor:
+    def forward(ctx: _Known, value: Tensor, gradients: Sequence[Tensor], *parameters: Parameter) -> Tensor:
         """Return the number."""
         ctx.gradients = gradients
         return value.clone()
 
     @staticmethod
-    def backward(ctx: Any, by_value: Tensor) -> Any:
+    def backward(ctx: _Known, by_value: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients."""
         return None, None, *(gradient * by_value for gradient in ctx.gradients)
 
@@ -148,16 +152,11 @@ def _flat(network: nn.Module) -> Iterator[nn.Module]:
         yield network
 
 
-class _Found(NamedTuple):
-    """Logits ``(*replicas, n, n_classes)``, and the gradient of each parameter."""
-
-    logits: Tensor
-    gradients: list[tuple[Parameter, Tensor]]
-
-
 @torch.no_grad()
-def _backward_all(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch) -> _Found:
-    r"""Back-propagation: ``\delta_{l-1} = \delta_l W_l \odot f'``."""
+def _backward_all(
+    layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch
+) -> tuple[Tensor, list[tuple[Parameter, Tensor]]]:
+    r"""Logits, and the gradient of each parameter: ``\delta_{l-1} = \delta_l W_l \odot f'``."""
     below, norms = [batch.v], []
     for layer in layers[:-1]:
         activation, norm = _forward(layer, below[-1])
@@ -174,7 +173,7 @@ def _backward_all(layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Te
         found += [(layer.weight, delta.mT @ below[number]), (layer.bias, delta.sum(-2))]
         if number > 0:
             delta = delta @ layer.weight
-    return _Found(logits.mT, found)
+    return logits.mT, found
 
 
 class _Normalised(NamedTuple):

@@ -7,7 +7,7 @@ logs are left out, because they cost more than an update of a small network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol, cast
 
 import torch
 from torch import Generator, nn
@@ -16,7 +16,6 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import Centring, weighted
-from memcomp_lightning.samplers import NegativePhaseSampler
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import BestPass
 from memcomp_lightning.training.diverged import require_finite
@@ -24,7 +23,7 @@ from memcomp_lightning.training.losses import Loss, cross_entropy
 from memcomp_lightning.training.schedules import OptimizerFactory, Schedule, begin_pass
 from memcomp_lightning.training.score import evaluate
 from memcomp_lightning.training.stages import Phase, PretrainingStage
-from memcomp_lightning.training.step import EnergyStep, StepState
+from memcomp_lightning.training.step import EnergyStep, Sampler, StepState
 from memcomp_lightning.types import Batch, Configurations
 
 
@@ -50,14 +49,14 @@ class Pass(NamedTuple):
     """
 
     number: int
-    state: Any
+    state: object
     positive: Configurations
 
 
 def pretrain(
     stage: PretrainingStage,
     batches: Batches,
-    sampler: NegativePhaseSampler[Any, Any],
+    sampler: Sampler,
     *,
     iterations: int,
     optimizer: OptimizerFactory,
@@ -117,7 +116,7 @@ class PhaseTraining:
     def __init__(
         self,
         phase: Phase,
-        sampler: NegativePhaseSampler[Any, Any],
+        sampler: Sampler,
         *,
         optimizer: OptimizerFactory,
         schedules: Sequence[Schedule] = (),
@@ -132,23 +131,15 @@ class PhaseTraining:
         self.passes_done = 0
         self._state = StepState()
 
-    @property
-    def state(self) -> Any:
-        """Of the sampler."""
-        return self._state.sampler
-
-    def go_on_with(self, sampler: NegativePhaseSampler[Any, Any], centring: Centring | None) -> None:
+    def go_on_with(self, sampler: Sampler, centring: Centring | None) -> None:
         """Take other settings for the passes that follow; another sampler starts anew."""
         if sampler != self.step.sampler:
             self._state = self._state._replace(sampler=None)
         self.step = EnergyStep(sampler=sampler, centring=centring)
 
+    @with_gradient()
     def run_pass(self, batches: Iterable[Batch]) -> Pass:
         """Update the model by each step of the batches, once."""
-        with with_gradient():
-            return self._run_pass(batches)
-
-    def _run_pass(self, batches: Iterable[Batch]) -> Pass:
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         state, phase = self._state, self.phase
         for batch in batches:
@@ -165,7 +156,7 @@ class PhaseTraining:
                 state = state.after_update()
         self.passes_done += 1
         self._state = state
-        return Pass(self.passes_done, self.state, positive)
+        return Pass(self.passes_done, state.sampler, positive)
 
 
 class ClassifierTraining:

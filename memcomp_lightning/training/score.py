@@ -1,11 +1,13 @@
 """How many images a network classifies correctly, and its mean loss on them."""
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from memcomp_lightning.training.losses import Loss, cross_entropy
+from memcomp_lightning.types import Batch
 
 
 class Score(NamedTuple):
@@ -45,7 +47,7 @@ def score(logits: Tensor, label: Tensor, loss: Loss = cross_entropy) -> Score:
 
 
 @torch.no_grad()
-def evaluate(network: nn.Module, batches: Any, loss: Loss = cross_entropy) -> Score:
+def evaluate(network: nn.Module, batches: Iterable[Batch], loss: Loss = cross_entropy) -> Score:
     """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
     was_training = network.training
     network.eval()

@@ -1,8 +1,8 @@
 """One update of an energy model: what Lightning's loop and the bare loop on the replica axis have in common."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
 
 from torch import Generator, Tensor
 
@@ -11,32 +11,20 @@ from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
 from memcomp_lightning.types import Configurations, NegativePhase
 
+Sampler: TypeAlias = NegativePhaseSampler[Any, Any]
+"""A sampler of the negative phase, for whatever models and with whatever state."""
 
-class Processes(Protocol):
-    """The processes that share an update, each with images of its own."""
+
+class Processes:
+    """The processes that share an update, each with images of its own: here one, alone."""
 
     def mean(self, value: Tensor) -> Tensor:
         """The mean over all of them."""
-        ...
-
-    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
-        """What the first one makes, in all of them."""
-        ...
-
-
-class OneProcess:
-    """Training in a single process: nothing to average or to hand on."""
-
-    def mean(self, value: Tensor) -> Tensor:
-        """The value itself."""
         return value
 
-    def from_first(self, make: Callable[[], NegativePhase[Any]]) -> NegativePhase[Any]:
-        """What is made here."""
+    def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
+        """What the first one makes, in all of them."""
         return make()
-
-
-_ALONE = OneProcess()
 
 
 class StepState(NamedTuple):
@@ -48,9 +36,9 @@ class StepState(NamedTuple):
         negative: Negative phase of an update whose images are not all in yet.
     """
 
-    sampler: Any = None
+    sampler: object = None
     offsets: Offsets | None = None
-    negative: NegativePhase[Any] | None = None
+    negative: NegativePhase[object] | None = None
 
     def after_update(self) -> "StepState":
         """The optimiser has stepped: the next batch begins another update."""
@@ -70,16 +58,16 @@ class EnergyStep:
         processes: Those that share the update.
     """
 
-    sampler: NegativePhaseSampler[Any, Any]
+    sampler: Sampler
     centring: Centring | None = None
-    processes: Processes = _ALONE
+    processes: Processes = field(default_factory=Processes)
 
     def __post_init__(self) -> None:
         require_sampler("sampler", self.sampler)
 
     def contrast(
         self, model: EnergyModel, positive: Configurations, state: StepState, *, generator: Generator
-    ) -> tuple[Tensor, NegativePhase[Any], StepState]:
+    ) -> tuple[Tensor, NegativePhase[object], StepState]:
         """Return the contrast ``(*replicas,)``, whose gradient is followed, the negative phase, and the new state.
 
         Args:
@@ -97,13 +85,13 @@ class EnergyStep:
         return gap, negative, StepState(negative.state, offsets, negative)
 
     def _negative_phase(
-        self, model: EnergyModel, positive: Configurations, state: Any, generator: Generator
-    ) -> NegativePhase[Any]:
+        self, model: EnergyModel, positive: Configurations, state: object, generator: Generator
+    ) -> NegativePhase[object]:
         """Ask the sampler; an answer that depends on the model alone is computed once for all processes."""
         if state is None:
             state = self.sampler.init(model, positive.v.shape[-2], generator=generator)
 
-        def sample() -> NegativePhase[Any]:
+        def sample() -> NegativePhase[object]:
             return self.sampler.sample(model, state, positive, generator=generator)
 
         return self.processes.from_first(sample) if self.sampler.shared else sample()
