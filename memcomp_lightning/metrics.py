@@ -7,10 +7,16 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from memcomp_lightning.likelihood import log_likelihood, log_pseudo_likelihood
+from memcomp_lightning.models import EnergyModel
 
 
 class _MeanOverImages(Metric):
-    """Sum and number of values, ``(*replicas,)`` each."""
+    """Sum and number of values, ``(*replicas,)`` each.
+
+    Args:
+        replicas: Leading axes of the model.
+        settings: Those of :class:`torchmetrics.Metric`.
+    """
 
     full_state_update = False
     higher_is_better = True
@@ -34,15 +40,10 @@ class _MeanOverImages(Metric):
 
 
 class MeanLogLikelihood(_MeanOverImages):
-    """Mean of ``log p(v)`` over images, nats: ``update(model, v, log_z)``.
-
-    Args:
-        replicas: Leading axes of the model.
-        settings: Those of :class:`torchmetrics.Metric`.
-    """
+    """Mean of ``log p(v)`` over images, nats: ``update(model, v, log_z)``."""
 
     @torch.no_grad()
-    def update(self, model: Any, v: Tensor, log_z: Tensor) -> None:
+    def update(self, model: EnergyModel, v: Tensor, log_z: Tensor) -> None:
         """Add a batch.
 
         Args:
@@ -54,15 +55,10 @@ class MeanLogLikelihood(_MeanOverImages):
 
 
 class MeanLogPseudoLikelihood(_MeanOverImages):
-    """Mean over images of ``sum_j log p(v_j | all other v)``, nats: ``update(model, v)``. It needs no log Z.
-
-    Args:
-        replicas: Leading axes of the model.
-        settings: Those of :class:`torchmetrics.Metric`.
-    """
+    """Mean over images of ``sum_j log p(v_j | all other v)``, nats: ``update(model, v)``. It needs no log Z."""
 
     @torch.no_grad()
-    def update(self, model: Any, v: Tensor) -> None:
+    def update(self, model: EnergyModel, v: Tensor) -> None:
         """Add a batch.
 
         Args:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from memcomp_lightning.callbacks.base import iteration_of, prefix_of
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.files import written_whole
+from memcomp_lightning.modules.weights import write_tensors
 from memcomp_lightning.training import DivergedError, diverged_parameter
 
 log = logging.getLogger(__name__)
@@ -116,9 +116,7 @@ class SaturationGuard(pl.Callback):
         folder = getattr(trainer.checkpoint_callback, "dirpath", None) or trainer.default_root_dir
         path = Path(folder) / "last_good.pt"
         if trainer.is_global_zero:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(path) as partial:
-                torch.save(self._good, partial)
+            write_tensors(self._good, path)
         return f"The last good weights, {self._good_at}, are in {path}."
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """What simple models reach on the same data: the numbers to compare a trained network with."""
 
 import warnings
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,16 +20,13 @@ def n_fitted(v: Tensor) -> int:
 
 
 def logistic_regression(train: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor]) -> float:
-    """Test accuracy of scikit-learn's logistic regression on the inputs themselves.
+    """Share of test images that scikit-learn's logistic regression on the inputs themselves classifies correctly.
 
     It is fitted to the first :func:`n_fitted` training images, once: the result is kept in the cache folder.
 
     Args:
         train: Intensities ``(n, n_visible)`` and labels ``(n,)``.
         test: The same of the test images.
-
-    Returns:
-        Share of the test images whose label is predicted.
     """
     from joblib import Memory  # with scikit-learn half a second, which not every command needs
 
@@ -43,7 +39,7 @@ def logistic_regression(train: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor
 
 
 def independent_log_likelihood(train_v: Tensor, v: Tensor) -> float:
-    """Mean log-likelihood of images under independent units that have the means of the training images.
+    """Mean log-likelihood of images, in nats, under independent units with the means of the training images.
 
     Intensities between 0 and 1 are probabilities of a 1; the mean over their draws is taken. The means count one
     more image with the unit on and one with it off, so that no probability is 0.
@@ -51,9 +47,6 @@ def independent_log_likelihood(train_v: Tensor, v: Tensor) -> float:
     Args:
         train_v: ``(n, n_visible)``.
         v: The images to judge, ``(n_judged, n_visible)``.
-
-    Returns:
-        Nats an image.
     """
     mean = (train_v.double().sum(-2) + 1) / (train_v.shape[-2] + 2)
     log_on, log_off = mean.log(), torch.log1p(-mean)
@@ -61,7 +54,10 @@ def independent_log_likelihood(train_v: Tensor, v: Tensor) -> float:
 
 
 def _fit_and_score(
-    train_v: NDArray[Any], train_label: NDArray[Any], test_v: NDArray[Any], test_label: NDArray[Any]
+    train_v: NDArray[np.generic],
+    train_label: NDArray[np.generic],
+    test_v: NDArray[np.generic],
+    test_label: NDArray[np.generic],
 ) -> float:
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.linear_model import LogisticRegression

@@ -34,11 +34,7 @@ def read_bytes(path: Path, md5: str) -> bytes:
 
 
 def unpacked(data: bytes, source: str) -> bytes:
-    """Return the content of a gzip stream.
-
-    Raises:
-        CorruptFileError: The stream is truncated or no gzip; the message names ``source``.
-    """
+    """Return the content of a gzip stream; raise a CorruptFileError, which names the source, if it has none."""
     try:
         return gzip.decompress(data)
     except (EOFError, OSError, zlib.error) as error:
@@ -46,11 +42,7 @@ def unpacked(data: bytes, source: str) -> bytes:
 
 
 def checked(data: bytes, md5: str, source: str) -> bytes:
-    """Return the bytes as they are.
-
-    Raises:
-        CorruptFileError: Their MD5 is another; the message names ``source``.
-    """
+    """Return the bytes as they are; raise a CorruptFileError, which names the source, if their MD5 is another."""
     found = hashlib.md5(data, usedforsecurity=False).hexdigest()
     if found != md5:
         raise CorruptFileError(

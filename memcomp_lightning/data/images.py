@@ -43,11 +43,7 @@ class PixelLayout:
         return self.height * self.width if self.pixels is None else len(self.pixels)
 
     def to_picture(self, v: Float[Tensor, "*leading n_visible"]) -> Float[Tensor, "*leading height width"]:
-        """Return the units as pictures, with 0 at the pixels that are no unit.
-
-        Raises:
-            SettingError: The last axis of ``v`` is not ``n_visible`` long.
-        """
+        """Return the units as pictures, with 0 at the pixels that are no unit."""
         require(v.shape[-1] == self.n_visible, "v.shape[-1]", v.shape[-1], f"{self.n_visible} visible units")
         if self.pixels is None:
             return v.reshape(*v.shape[:-1], self.height, self.width)
@@ -83,13 +79,8 @@ class ImageData:
 
     def __post_init__(self) -> None:
         require_count("n_classes", self.n_classes)
-        for subset, v, label in (
-            ("train", self.train_v, self.train_label),
-            ("test", self.test_v, self.test_label),
-        ):
-            _check_shapes(subset, v, label, self.layout)
-            _check_intensities(f"{subset}_v", v)
-            _check_labels(f"{subset}_label", label, self.n_classes)
+        _check("train", self.train_v, self.train_label, self)
+        _check("test", self.test_v, self.test_label, self)
 
     @property
     def n_visible(self) -> int:
@@ -113,36 +104,26 @@ def same_patterns(
     return ImageData(train_v, train_label, v, label, n_classes, layout, name)
 
 
-def _check_shapes(subset: str, v: Tensor, label: Tensor, layout: PixelLayout) -> None:
-    name = f"{subset}_v"
+def _check(subset: str, v: Tensor, label: Tensor, images: ImageData) -> None:
+    name, n_visible = f"{subset}_v", images.layout.n_visible
     require(v.dtype == torch.float32, f"{name}.dtype", v.dtype, "torch.float32", "Convert with .float().")
-    allowed = f"(n, {layout.n_visible}): n >= 1 images of the {layout.n_visible} units of the pixel layout"
-    matches = v.ndim == 2 and v.shape[0] >= 1 and v.shape[1] == layout.n_visible
+    matches = v.ndim == 2 and v.shape[0] >= 1 and v.shape[1] == n_visible
+    allowed = f"(n, {n_visible}): n >= 1 images of the {n_visible} units of the pixel layout"
     remedy = "Flatten each image, or give the layout that belongs to these images."
     require(matches, f"{name}.shape", tuple(v.shape), allowed, remedy)
-    name = f"{subset}_label"
-    require(label.dtype == torch.int64, f"{name}.dtype", label.dtype, "torch.int64", "Convert with .long().")
-    require(
-        label.shape == v.shape[:1],
-        f"{name}.shape",
-        tuple(label.shape),
-        f"({v.shape[0]},), one label for each image of {subset}_v",
-    )
-
-
-def _check_intensities(name: str, v: Tensor) -> None:
     low, high = v.aminmax()
     # A comparison with NaN is false, and aminmax returns NaN where there is one: this refuses NaN as well.
     if not (low >= 0 and high <= 1):
         row, unit = (~((v >= 0) & (v <= 1))).nonzero()[0].tolist()
         remedy = "Scale the intensities (bytes: divide by 255) and replace missing values."
         require(False, f"{name}[{row}, {unit}]", v[row, unit].item(), "a finite value in [0, 1]", remedy)
-
-
-def _check_labels(name: str, label: Tensor, n_classes: int) -> None:
-    outside = ((label < 0) | (label >= n_classes)).nonzero()
+    name = f"{subset}_label"
+    require(label.dtype == torch.int64, f"{name}.dtype", label.dtype, "torch.int64", "Convert with .long().")
+    allowed = f"({v.shape[0]},), one label for each image of {subset}_v"
+    require(label.shape == v.shape[:1], f"{name}.shape", tuple(label.shape), allowed)
+    outside = ((label < 0) | (label >= images.n_classes)).nonzero()
     if len(outside):
         index = int(outside[0])
-        allowed = f"a class index from 0 to {n_classes - 1}"
+        allowed = f"a class index from 0 to {images.n_classes - 1}"
         remedy = "Number the classes from 0, or set n_classes."
         require(False, f"{name}[{index}]", label[index].item(), allowed, remedy)

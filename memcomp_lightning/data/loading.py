@@ -129,11 +129,7 @@ class Batches:
         self._resume: dict[str, int] | None = None
 
     def repeated(self, seeds: Sequence[int]) -> "Batches":
-        """Return the same images once for each seed, each time in the order of that seed, on one replica axis.
-
-        Args:
-            seeds: One for each repetition, at least one; equal seeds have the same order.
-        """
+        """Return the same images once for each seed, in the order of that seed, on one replica axis."""
         require(len(seeds) > 0, "seeds", list(seeds), "at least one seed")
         if isinstance(self._v, SparseRows) or self._weight is not None:
             raise ValueError(
@@ -166,11 +162,7 @@ class Batches:
         return None
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the passes that start from now on.
-
-        Args:
-            epoch: Index of the pass, >= 0.
-        """
+        """Choose the order of the passes that start from now on, by the index of the first, >= 0."""
         require_count("epoch", epoch, minimum=0)
         self._epoch = epoch
 
@@ -192,11 +184,7 @@ class Batches:
         return dict(self._progress)
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Let the next pass start where the saved one was, if it is of the same epoch.
-
-        Args:
-            state: What :meth:`state_dict` returned.
-        """
+        """Let the next pass start where the saved one was, if it is of the same epoch."""
         self._resume = self._progress = dict(state)
 
     def _batch(self, chunk: "_Chunk", order: Tensor | None) -> Batch:
@@ -207,20 +195,17 @@ class Batches:
         elif order is None:
             v, label = v[..., positions, :], label[..., positions]
         else:
-            v, label = self._gather(v, order[..., positions])
+            # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
+            # of torch.take_along_dim, which looks up each single value.
+            index = order[..., positions]
+            v = v.flatten(0, -2).index_select(0, index.flatten()).view(*index.shape, -1)
+            label = label.flatten().index_select(0, index.flatten()).view(index.shape)
         if self._weight is None:
             return Batch(v, label, chunk.share, chunk.closes_step)
         weights = self._weight if order is None else self._weight[order]
         weight = weights[positions]
         share = self._world_size * float(weight.sum()) / float(weights[chunk.step].sum())
         return Batch(v, label, share, chunk.closes_step, weight)
-
-    def _gather(self, v: Tensor, index: Int[Tensor, "*replicas n_chunk"]) -> tuple[Tensor, Tensor]:
-        # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
-        # of torch.take_along_dim, which looks up each single value.
-        flat = index.flatten()
-        gathered = v.flatten(0, -2).index_select(0, flat).view(*index.shape, -1)
-        return gathered, self._label.flatten().index_select(0, flat).view(index.shape)
 
     def _order(self) -> Int[Tensor, "*replicas n"]:
         """Return this epoch's order, as rows of all replicas' images laid end to end."""
@@ -252,7 +237,21 @@ def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size
     for start in range(0, n, batch_size or n):
         step = range(start, min(start + (batch_size or n), n))
         n_chunks = math.ceil(math.ceil(len(step) / world_size) / chunk_size)
-        _check_step(len(step), n_chunks, batch_size, chunk_size, world_size)
+        # An empty chunk is refused: the mean over it is NaN.
+        require(
+            len(step) >= world_size,
+            "batch_size",
+            batch_size,
+            f"at least one image for each process in every step, but a step has {len(step)} images for "
+            f"{world_size} processes",
+            "Choose a batch_size that leaves more in the last step, or use fewer processes.",
+        )
+        require(
+            len(step) // world_size >= n_chunks,
+            "chunk_size",
+            chunk_size,
+            f"an integer >= 2, because {world_size} processes share a step of {len(step)} images unevenly",
+        )
         shard = step[rank::world_size]
         bounds = [k * len(shard) // n_chunks for k in range(n_chunks + 1)]
         for k in range(n_chunks):
@@ -261,21 +260,3 @@ def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size
             share = world_size * len(part) / len(step)
             plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1))
     return plan
-
-
-def _check_step(n_step: int, n_chunks: int, batch_size: int | None, chunk_size: int, world_size: int) -> None:
-    """Refuse a step in which a process would have an empty chunk: the mean over it is NaN."""
-    require(
-        n_step >= world_size,
-        "batch_size",
-        batch_size,
-        f"at least one image for each process in every step, but a step has {n_step} images for "
-        f"{world_size} processes",
-        "Choose a batch_size that leaves more in the last step, or use fewer processes.",
-    )
-    require(
-        n_step // world_size >= n_chunks,
-        "chunk_size",
-        chunk_size,
-        f"an integer >= 2, because {world_size} processes share a step of {n_step} images unevenly",
-    )

@@ -8,7 +8,6 @@ import urllib.error
 import urllib.request
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxtyping import UInt8
 from torch import Tensor
@@ -37,13 +36,8 @@ TIMEOUT_S = 20.0
 """How long a download waits for a silent mirror."""
 
 
-class MnistArrays(NamedTuple):
-    """The content of the four files: shared between loads, never written to."""
-
-    train_images: UInt8[Tensor, "n_train 28 28"]
-    train_labels: UInt8[Tensor, " n_train"]
-    test_images: UInt8[Tensor, "n_test 28 28"]
-    test_labels: UInt8[Tensor, " n_test"]
+Labelled = tuple[UInt8[Tensor, "n 28 28"], UInt8[Tensor, " n"]]
+"""Images and their labels."""
 
 
 def cache_folder() -> Path:
@@ -61,8 +55,8 @@ def raw_folder(data_dir: str | None) -> Path:
     return (Path(root).expanduser().absolute() if root else cache_folder()) / "MNIST" / "raw"
 
 
-def read(data_dir: str | None, *, download: bool) -> MnistArrays:
-    """Return the arrays, after fetching the files that are missing.
+def read(data_dir: str | None, *, download: bool) -> tuple[Labelled, Labelled]:
+    """Return training and test set, after fetching the files that are missing.
 
     Args:
         data_dir: See :func:`raw_folder`.
@@ -84,14 +78,12 @@ def read(data_dir: str | None, *, download: bool) -> MnistArrays:
 
 
 @lru_cache(maxsize=2)
-def _arrays(folder: Path) -> MnistArrays:
-    """Return the arrays of a folder that holds all files; two loads in one process unpack them once."""
-    train = _read_pair(folder, "train")
-    test = _read_pair(folder, "t10k")
-    return MnistArrays(*train, *test)
+def _arrays(folder: Path) -> tuple[Labelled, Labelled]:
+    """Return the arrays of a folder that holds all files: shared between loads, never written to."""
+    return _read_pair(folder, "train"), _read_pair(folder, "t10k")
 
 
-def _read_pair(folder: Path, subset: str) -> tuple[Tensor, Tensor]:
+def _read_pair(folder: Path, subset: str) -> Labelled:
     images = _read_array(folder, f"{subset}-images-idx3-ubyte", n_axes=3)
     labels = _read_array(folder, f"{subset}-labels-idx1-ubyte", n_axes=1)
     if images.shape != (len(labels), 28, 28):

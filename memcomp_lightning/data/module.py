@@ -25,6 +25,9 @@ class ImageDataModule(LightningDataModule):
     Attributes:
         replicas: Leading axes of the batches: ``()``, or the number of parts in use, ``(n,)``.
         n_train: Training images of one replica, without those held out.
+        train: Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out.
+        test: Test images ``(n, n_visible)`` and labels ``(n,)``.
+        heldout: The images of the validation: those held out, or the test images, which all replicas share.
 
     Args:
         images: The data.
@@ -55,7 +58,7 @@ class ImageDataModule(LightningDataModule):
         partition_seed: int = 0,
     ) -> None:
         super().__init__()
-        self._check(images, partitions, validation_fraction, partition_seed)
+        n_part, n_held_out = _split(images, partitions, validation_fraction, partition_seed)
         n_parts = partitions
         if first_partitions is not None:
             require_count("first_partitions", first_partitions)
@@ -63,40 +66,23 @@ class ImageDataModule(LightningDataModule):
         self.images = images
         self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
-        n_part = len(images.train_label) // partitions
-        n_held_out = round(validation_fraction * n_part)
         self.n_train = n_part - n_held_out
-        self._train = images.train_v, images.train_label
-        self._held_out = images.test_v, images.test_label
+        self.train = images.train_v, images.train_label
+        self.test = self.heldout = images.test_v, images.test_label
         # Without parts and without a held-out set there is nothing to deal, and no copy of the images.
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
             order = torch.randperm(len(images.train_label), generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
-            self._train = self._take(order[..., : self.n_train])
+            self.train = self._take(order[..., : self.n_train])
             if n_held_out:
-                self._held_out = self._take(order[..., self.n_train :])
+                self.heldout = self._take(order[..., self.n_train :])
         self.train_batches(rank=0, world_size=1)
-
-    @property
-    def train(self) -> tuple[Tensor, Tensor]:
-        """Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
-        return self._train
-
-    @property
-    def heldout(self) -> tuple[Tensor, Tensor]:
-        """The images of the validation: those held out, or the test images, which all replicas share."""
-        return self._held_out
-
-    @property
-    def test(self) -> tuple[Tensor, Tensor]:
-        """Test images ``(n, n_visible)`` and labels ``(n,)``."""
-        return self.images.test_v, self.images.test_label
 
     @property
     def validation(self) -> tuple[Tensor, Tensor] | None:
         """Held-out training images ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
-        return None if self._held_out[0] is self.images.test_v else self._held_out
+        return None if self.heldout is self.test else self.heldout
 
     @property
     def n_at_once(self) -> int:
@@ -119,27 +105,23 @@ class ImageDataModule(LightningDataModule):
         return self.images.layout
 
     def train_dataloader(self) -> Batches:
-        """Return the shuffled training batches of this process.
-
-        Raises:
-            SettingError: A step has fewer images than there are processes.
-        """
+        """Return the shuffled training batches of this process."""
         if self.trainer is None:
             return self.train_batches(rank=0, world_size=1)
         return self.train_batches(self.trainer.global_rank, self.trainer.world_size)
 
     def val_dataloader(self) -> Batches:
         """Return the held-out images, or the test images if none are held out."""
-        return self._evaluation_batches(*self._held_out)
+        return self._evaluation_batches(*self.heldout)
 
     def test_dataloader(self) -> Batches:
         """Return the test images, the same for every replica."""
-        return self._evaluation_batches(self.images.test_v, self.images.test_label)
+        return self._evaluation_batches(*self.test)
 
     def train_batches(self, rank: int, world_size: int) -> Batches:
         """Return the shuffled training batches of one of ``world_size`` processes."""
         return Batches(
-            *self._train,
+            *self.train,
             batch_size=self._batch_size,
             chunk_size=self._chunk_size,
             shuffle=True,
@@ -156,22 +138,23 @@ class ImageDataModule(LightningDataModule):
     def _take(self, index: Tensor) -> tuple[Tensor, Tensor]:
         return self.images.train_v[index], self.images.train_label[index]
 
-    @staticmethod
-    def _check(images: ImageData, partitions: int, validation_fraction: float, partition_seed: int) -> None:
-        n = len(images.train_label)
-        require_count("partitions", partitions)
-        allowed = f"at most the {n} training images"
-        require(partitions <= n, "partitions", partitions, allowed)
-        require_count("partition_seed", partition_seed, minimum=0)
-        in_range = isinstance(validation_fraction, int | float) and 0 <= validation_fraction < 1
-        require(in_range, "validation_fraction", validation_fraction, "a number in [0, 1)")
-        n_part = n // partitions
-        n_held_out = round(validation_fraction * n_part)
-        require(
-            validation_fraction == 0 or 1 <= n_held_out < n_part,
-            "validation_fraction",
-            validation_fraction,
-            f"0, or a share that holds out at least 1 and leaves at least 1 of {n_part} images; "
-            f"this one holds out {n_held_out}",
-            "Change validation_fraction or use fewer partitions.",
-        )
+
+def _split(images: ImageData, partitions: int, validation_fraction: float, partition_seed: int) -> tuple[int, int]:
+    """Images of a part, and how many of them are held out."""
+    n = len(images.train_label)
+    require_count("partitions", partitions)
+    require(partitions <= n, "partitions", partitions, f"at most the {n} training images")
+    require_count("partition_seed", partition_seed, minimum=0)
+    in_range = isinstance(validation_fraction, int | float) and 0 <= validation_fraction < 1
+    require(in_range, "validation_fraction", validation_fraction, "a number in [0, 1)")
+    n_part = n // partitions
+    n_held_out = round(validation_fraction * n_part)
+    require(
+        validation_fraction == 0 or 1 <= n_held_out < n_part,
+        "validation_fraction",
+        validation_fraction,
+        f"0, or a share that holds out at least 1 and leaves at least 1 of {n_part} images; "
+        f"this one holds out {n_held_out}",
+        "Change validation_fraction or use fewer partitions.",
+    )
+    return n_part, n_held_out

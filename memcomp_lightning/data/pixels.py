@@ -39,20 +39,16 @@ class GreySource(ABC):
         """Return the images in grey."""
 
     def load(self) -> ImageData:
-        """Return the images.
-
-        Raises:
-            FileNotFoundError: A file is missing and could not be fetched.
-            CorruptFileError: A file does not hold what it must.
-        """
+        """Return the images, in grey or as bits."""
         images = self.load_grey()
         if self.pixels == "grey":
             return images
-        train_v, test_v = self._bits(images.train_v, images.test_v)
-        return replace(images, train_v=train_v, test_v=test_v, name=f"{images.name}_{self.pixels}")
-
-    def _bits(self, *grey: Tensor) -> list[Tensor]:
-        if self.pixels == "threshold":
-            return [(v > self.threshold).float() for v in grey]
         generator = rng.stream(self.seed, "binarisation")
-        return [rng.bernoulli(v, generator=generator) for v in grey]
+
+        def bits(v: Tensor) -> Tensor:
+            if self.pixels == "threshold":
+                return (v > self.threshold).float()
+            return rng.bernoulli(v, generator=generator)
+
+        train_v, test_v = bits(images.train_v), bits(images.test_v)
+        return replace(images, train_v=train_v, test_v=test_v, name=f"{images.name}_{self.pixels}")

@@ -2,6 +2,7 @@
 
 import copy
 from abc import abstractmethod
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -14,24 +15,32 @@ from torch import Generator, Tensor, nn
 from torch.optim import SGD
 
 from memcomp_lightning.data import Batches
-from memcomp_lightning.defaults import CENTRING_RATE
+from memcomp_lightning.defaults import BATCH_SIZE, CENTRING_RATE
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.estimators.inputs import Array, Matrix, Samples, Scaling
 from memcomp_lightning.estimators.settings import NestedSettings
 from memcomp_lightning.models import DBN
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.training import BestPass, ClassifierTraining, OptimizerFactory, PhaseTraining
+from memcomp_lightning.training import BestPass, OptimizerFactory, Sampler
 
 RandomState = int | np.random.RandomState | np.random.Generator | None
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class MemcompEstimator(NestedSettings):
     """Base of both estimators: reads dense and sparse inputs, float64 or float32; scales what leaves [0, 1]."""
 
-    _scaling: Scaling
-    _training: PhaseTraining | ClassifierTraining
+    sampler: Sampler | None = None
+    centred: bool = True
+    batch_size: int | None = BATCH_SIZE
+    early_stopping: bool = False
+    validation_fraction: float = 0.1
+    n_iter_no_change: int = 10
+    tol: float = 1e-4
+    verbose: bool = False
+    random_state: RandomState = None
 
     def __sklearn_tags__(self) -> Tags:
         tags = super().__sklearn_tags__()

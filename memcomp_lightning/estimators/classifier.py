@@ -1,8 +1,9 @@
 """The deep belief network as a classifier."""
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from numbers import Real
-from typing import Any, Literal, Self
+from typing import Literal, Self, cast
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from sklearn.base import ClassifierMixin
 from sklearn.model_selection import train_test_split
 from sklearn.utils.multiclass import _check_partial_fit_first_call, check_classification_targets
 from sklearn.utils.validation import column_or_1d
-from torch import Tensor
+from torch import Tensor, nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
@@ -28,7 +29,6 @@ from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.estimators.base import (
     Drawn,
     MemcompEstimator,
-    RandomState,
     array_of,
     dbn_for,
     in_precision_of,
@@ -36,8 +36,9 @@ from memcomp_lightning.estimators.base import (
     sgd,
 )
 from memcomp_lightning.estimators.inputs import Array, Matrix, Samples, batches_of, hidden_means, log_odds_of
+from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier
-from memcomp_lightning.samplers import GroundState, NegativePhaseSampler
+from memcomp_lightning.samplers import GroundState
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.training import ClassifierTraining, Greedy, Joint, pretrain, require_finite
 
@@ -45,6 +46,7 @@ UNLABELLED = -1
 """Label of the samples that have none, where the other labels are numbers."""
 
 
+@dataclass(eq=False, repr=False)
 class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[misc]
     """Deep belief network: layers pretrained by any sampler, then back-propagation with an output layer.
 
@@ -70,11 +72,8 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         weight_std: Standard deviation of the first weights, > 0.
         early_stopping: Hold out labelled samples, the same share of each class, stop once their accuracy no longer
             rises, and keep the weights of the best pass. Layers are not pretrained on them either.
-        validation_fraction: Share held out, in (0, 1).
-        n_iter_no_change: Passes without a better accuracy, >= 1, after which training stops.
-        tol: By how much an accuracy must be better to count, >= 0.
-        verbose: Print a line a pass of back-propagation.
-        random_state: Seed, generator or None, as everywhere in scikit-learn; NumPy's ``Generator`` too.
+        validation_fraction, n_iter_no_change, tol: As for :class:`MemcompRBM`, of the accuracy.
+        verbose, random_state: As for :class:`MemcompRBM`.
 
     Attributes:
         classes_: Labels.
@@ -88,46 +87,16 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
     ['a', 'b', 'a', 'b']
     """
 
-    def __init__(
-        self,
-        hidden_layer_sizes: int | Sequence[int] = (32, 32),
-        *,
-        sampler: NegativePhaseSampler[Any, Any] | None = None,
-        pretrain: Literal["greedy", "joint"] = "greedy",
-        n_iter_pretrain: int = PASSES,
-        pretrain_learning_rate: float = LEARNING_RATE,
-        pretrain_batch_size: int | None = BATCH_SIZE,
-        centred: bool = True,
-        n_iter: int = FINETUNING_PASSES,
-        learning_rate: float = FINETUNING_LEARNING_RATE,
-        momentum: float = FINETUNING_MOMENTUM,
-        batch_size: int | None = BATCH_SIZE,
-        weight_std: float = 0.1,
-        early_stopping: bool = False,
-        validation_fraction: float = 0.1,
-        n_iter_no_change: int = 10,
-        tol: float = 1e-4,
-        verbose: bool = False,
-        random_state: RandomState = None,
-    ) -> None:
-        self.hidden_layer_sizes = hidden_layer_sizes
-        self.sampler = sampler
-        self.pretrain = pretrain
-        self.n_iter_pretrain = n_iter_pretrain
-        self.pretrain_learning_rate = pretrain_learning_rate
-        self.pretrain_batch_size = pretrain_batch_size
-        self.centred = centred
-        self.n_iter = n_iter
-        self.learning_rate = learning_rate
-        self.momentum = momentum
-        self.batch_size = batch_size
-        self.weight_std = weight_std
-        self.early_stopping = early_stopping
-        self.validation_fraction = validation_fraction
-        self.n_iter_no_change = n_iter_no_change
-        self.tol = tol
-        self.verbose = verbose
-        self.random_state = random_state
+    hidden_layer_sizes: int | Sequence[int] = (32, 32)
+    _: KW_ONLY
+    pretrain: Literal["greedy", "joint"] = "greedy"
+    n_iter_pretrain: int = PASSES
+    pretrain_learning_rate: float = LEARNING_RATE
+    pretrain_batch_size: int | None = BATCH_SIZE
+    n_iter: int = FINETUNING_PASSES
+    learning_rate: float = FINETUNING_LEARNING_RATE
+    momentum: float = FINETUNING_MOMENTUM
+    weight_std: float = 0.1
 
     def _default_sampler(self) -> GroundState:
         return GroundState(solver=DmmSolver())
@@ -228,7 +197,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         self._sizes()
 
     def _sizes(self) -> list[int]:
-        sizes: list[Any] = np.atleast_1d(np.asarray(self.hidden_layer_sizes, dtype=object)).tolist()
+        sizes = np.atleast_1d(np.asarray(self.hidden_layer_sizes, dtype=object)).tolist()
         require(len(sizes) > 0, "hidden_layer_sizes", self.hidden_layer_sizes, "at least one layer")
         for size in sizes:
             require_count("hidden_layer_sizes", size)
@@ -288,10 +257,11 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         return float(np.average(right, weights=samples.weight))
 
     @torch.no_grad()
-    def _logits(self, network: Any, X: Matrix) -> Tensor:
-        dbn, output = network
-        h = hidden_means(dbn[0], X)
-        for rbm in list(dbn)[1:]:
+    def _logits(self, network: nn.Module, X: Matrix) -> Tensor:
+        dbn, output = network.children()
+        lowest, *others = cast(DBN, dbn)
+        h = hidden_means(lowest, X)
+        for rbm in others:
             h = rbm(h)
         logits: Tensor = output(h)
         return logits

@@ -1,6 +1,7 @@
 """The restricted Boltzmann machine as a transformer."""
 
-from typing import Any, Self
+from dataclasses import KW_ONLY, dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
 from memcomp_lightning.data import Batches
-from memcomp_lightning.defaults import BATCH_SIZE, LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
+from memcomp_lightning.defaults import LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.estimators.base import (
     MemcompEstimator,
@@ -38,15 +39,15 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
     log_pseudo_likelihood,
 )
-from memcomp_lightning.models import RBM
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.samplers import PCD, NegativePhaseSampler
+from memcomp_lightning.samplers import PCD
 from memcomp_lightning.training import Greedy, PhaseTraining, require_finite
 
 MOST_ENUMERATED = 20
 """Units of the smaller layer up to which a log-likelihood is exact."""
 
 
+@dataclass(eq=False, repr=False)
 class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstimator):  # type: ignore[misc]
     """Bernoulli RBM whose negative phase is any sampler of this package.
 
@@ -86,37 +87,10 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
     (4, 2)
     """
 
-    rbm_: RBM
-    _training: PhaseTraining
-
-    def __init__(
-        self,
-        n_components: int = 64,
-        *,
-        sampler: NegativePhaseSampler[Any, Any] | None = None,
-        learning_rate: float = LEARNING_RATE,
-        batch_size: int | None = BATCH_SIZE,
-        n_iter: int = PASSES,
-        centred: bool = True,
-        early_stopping: bool = False,
-        validation_fraction: float = 0.1,
-        n_iter_no_change: int = 10,
-        tol: float = 1e-4,
-        verbose: bool = False,
-        random_state: RandomState = None,
-    ) -> None:
-        self.n_components = n_components
-        self.sampler = sampler
-        self.learning_rate = learning_rate
-        self.batch_size = batch_size
-        self.n_iter = n_iter
-        self.centred = centred
-        self.early_stopping = early_stopping
-        self.validation_fraction = validation_fraction
-        self.n_iter_no_change = n_iter_no_change
-        self.tol = tol
-        self.verbose = verbose
-        self.random_state = random_state
+    n_components: int = 64
+    _: KW_ONLY
+    learning_rate: float = LEARNING_RATE
+    n_iter: int = PASSES
 
     def _default_sampler(self) -> PCD:
         return PCD(n_chains=N_CHAINS)

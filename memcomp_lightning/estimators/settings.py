@@ -6,17 +6,17 @@ from typing import Any
 
 from sklearn.base import BaseEstimator
 
-from memcomp_lightning.samplers import NegativePhaseSampler
+from memcomp_lightning.training import Sampler
 
 
 class NestedSettings(BaseEstimator):  # type: ignore[misc]
     """An estimator whose samplers, and what is inside them, have names like ``sampler__inner__k``."""
 
     @abstractmethod
-    def _default_sampler(self) -> NegativePhaseSampler[Any, Any]:
+    def _default_sampler(self) -> Sampler:
         """What ``sampler=None`` stands for."""
 
-    def _negative_phase(self) -> NegativePhaseSampler[Any, Any]:
+    def _negative_phase(self) -> Sampler:
         return self._default_sampler() if self.sampler is None else self.sampler
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
@@ -34,12 +34,11 @@ class NestedSettings(BaseEstimator):  # type: ignore[misc]
             ValueError: There is no such setting.
             SettingError: A sampler refuses the value.
         """
-        own = {name: value for name, value in params.items() if "__" not in name}
-        super().set_params(**own)
+        super().set_params(**{name: value for name, value in params.items() if "__" not in name})
         nested: dict[str, dict[str, Any]] = {}
         for name, value in params.items():
-            if "__" in name:
-                outer, _, inner = name.partition("__")
+            outer, nests, inner = name.partition("__")
+            if nests:
                 nested.setdefault(outer, {})[inner] = value
         for outer, values in nested.items():
             held = self._meant(outer, getattr(self, outer, None))

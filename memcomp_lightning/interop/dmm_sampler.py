@@ -13,6 +13,7 @@ from memcomp_lightning.solvers.dmm import DmmSolver
 
 try:
     import dimod
+    from dimod import SampleSet
 
     from memcomp_lightning.problems.bqm import from_bqm
 except ModuleNotFoundError:
@@ -39,7 +40,7 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         return {"num_reads": [], "seed": []}
 
     @property
-    def properties(self) -> dict[str, Any]:
+    def properties(self) -> dict[str, str]:
         """The solver with its settings."""
         return {"solver": repr(self.solver)}
 
@@ -49,8 +50,8 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         *,
         num_reads: int | None = None,
         seed: int | None = None,
-        **given: Any,
-    ) -> Any:
+        **given: object,
+    ) -> SampleSet:
         """Return a SampleSet, one sample a restart, those that were not run left out.
 
         Args:
@@ -61,10 +62,12 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         """
         self.remove_unknown_kwargs(**given)
         if not bqm.num_variables:
-            return _sample_set([], bqm)
+            return SampleSet.from_samples_bqm([], bqm)
         solver: Any = self.solver
         if num_reads is not None:
-            solver = _with_reads(solver, num_reads)
+            if not hasattr(solver, "n_restarts"):
+                raise ValueError(f"num_reads = {num_reads}: {type(solver).__name__} has no n_restarts to set.")
+            solver = dataclasses.replace(solver, n_restarts=num_reads)
         problem, variables = from_bqm(bqm)
         solution = solver.minimise(problem, generator=rng.numpy_stream(0 if seed is None else seed, "solver"))
         was_run = solution.status != int(Status.NOT_RUN)
@@ -72,14 +75,4 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         if bqm.vartype is dimod.SPIN:
             x = 2 * x - 1
         info = {"wall_time_s": solution.wall_time_s, "messages": solution.messages()}
-        return _sample_set((np.ascontiguousarray(x), variables), bqm, info=info)
-
-
-_sample_set: Any = dimod.SampleSet.from_samples_bqm
-
-
-def _with_reads(solver: Any, num_reads: int) -> Any:
-    """The solver with so many restarts."""
-    if not hasattr(solver, "n_restarts"):
-        raise ValueError(f"num_reads = {num_reads}: {type(solver).__name__} has no n_restarts to set.")
-    return dataclasses.replace(solver, n_restarts=num_reads)
+        return SampleSet.from_samples_bqm((np.ascontiguousarray(x), variables), bqm, info=info)

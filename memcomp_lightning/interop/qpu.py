@@ -90,17 +90,17 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         return [self.qpu]
 
     @property
-    def parameters(self) -> Mapping[str, Any]:
+    def parameters(self) -> Mapping[str, object]:
         """Those of the annealer, and the seed of the gauges."""
         return {**self.qpu.parameters, "seed": []}
 
     @property
-    def properties(self) -> Mapping[str, Any]:
+    def properties(self) -> Mapping[str, object]:
         """Those of the annealer."""
         return {"child_properties": self.qpu.properties}
 
     def sample(
-        self, bqm: BinaryQuadraticModel, *, num_reads: int = 100, seed: int | None = None, **parameters: Any
+        self, bqm: BinaryQuadraticModel, *, num_reads: int = 100, seed: int | None = None, **parameters: object
     ) -> SampleSet:
         """Return ``num_reads`` reads; ``chain_break_fraction`` is a field of each.
 
@@ -131,11 +131,7 @@ class QpuSampler(dimod.ComposedSampler):  # type: ignore[name-defined, misc]
         return answer
 
     def layout(self, bqm: BinaryQuadraticModel) -> Layout:
-        """The place of a model, found once for a graph.
-
-        Raises:
-            SettingError: There is none on this annealer.
-        """
+        """The place of a model, found once for a graph; raise a SettingError if it has none on this annealer."""
         graph = frozenset(bqm.variables), frozenset(frozenset(pair) for pair in bqm.quadratic)
         if graph not in self._known:
             working = self.qpu.to_networkx_graph()

@@ -20,13 +20,9 @@ class BaselineClassifier(Classifier):
         hidden_sizes: Units of each hidden layer.
         n_classes: Size of the output layer, >= 2.
         replicas: Leading axes of independent networks.
-        iterations: Passes over the training set, >= 1.
-        optimizer: Builds the optimiser.
-        schedules: Change the optimiser from pass to pass.
-        loss: As for :class:`Classifier`.
+        iterations, optimizer, schedules, loss, seed: As for :class:`Classifier`.
         weight_init: Draws all weights.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
-        seed: Seed of the random streams.
     """
 
     def __init__(
@@ -45,12 +41,7 @@ class BaselineClassifier(Classifier):
         seed: int = 0,
     ) -> None:
         network = BatchNormReluNetwork(
-            n_visible,
-            hidden_sizes,
-            n_classes,
-            replicas=replicas,
-            weight_init=weight_init,
-            generator=generator,
+            n_visible, hidden_sizes, n_classes, replicas=replicas, weight_init=weight_init, generator=generator
         )
         super().__init__(
             network, iterations=iterations, optimizer=optimizer, schedules=schedules, loss=loss, seed=seed

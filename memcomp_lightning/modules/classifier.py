@@ -23,9 +23,6 @@ class Classifier(StageModule):
         schedules: Change the optimiser from pass to pass.
         loss: "cross_entropy", or "squared_error" of sigmoid outputs.
         seed: Seed of the random streams.
-
-    Raises:
-        SettingError: ``iterations`` or ``loss`` out of range.
     """
 
     stage = "finetune"

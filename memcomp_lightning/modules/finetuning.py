@@ -19,14 +19,10 @@ class DBNClassifier(Classifier):
     Args:
         dbn: The network, pretrained or not; trained in place.
         n_classes: Size of the output layer, >= 2.
-        iterations: Passes over the training set, >= 1.
-        optimizer: Builds the optimiser.
-        schedules: Change the optimiser from pass to pass.
-        loss: As for :class:`Classifier`.
+        iterations, optimizer, schedules, loss, seed: As for :class:`Classifier`.
         units: Hidden units: "sigmoid", or "batch_norm_relu" for batch normalisation and ReLU on the same weights.
         output_init: Draws the weights of the output layer; None is N(0, 0.01^2).
         generator: Random stream of these weights; None is a fresh stream of seed 0.
-        seed: Seed of the random streams.
     """
 
     def __init__(

@@ -106,11 +106,7 @@ class StageModule(pl.LightningModule):
         return self.trainer.optimizers[0]
 
     def configure_callbacks(self) -> list[pl.Callback]:
-        """Add none; check the trainer, before its callbacks set anything up.
-
-        Raises:
-            SettingError: The trainer has a setting or a callback that a stage does not go together with.
-        """
+        """Add none; check the trainer, by :func:`check_trainer`, before its callbacks set anything up."""
         if self.trainer.state.fn == TrainerFn.FITTING:
             check_trainer(self.trainer)
         return []
@@ -200,7 +196,7 @@ class StageModule(pl.LightningModule):
             "passes_done": self._passes_done,
             "stop_asked": self._stop_asked or self.trainer.should_stop,
         }
-        states: list[Any] = [own]
+        states: list[dict[str, Any] | None] = [own]
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             states = [None] * torch.distributed.get_world_size()
             torch.distributed.all_gather_object(states, own)
@@ -226,11 +222,12 @@ class StageModule(pl.LightningModule):
                 f"the checkpoint holds the random streams of {len(states)} processes, this run has "
                 f"{self.trainer.world_size}: resume with trainer.devices={len(states)}, or start a new run."
             )
-        rng.restore(self.streams, states[self.global_rank]["streams"])
-        self.take_extra_state(states[self.global_rank]["extra"])
-        self._seconds_before = states[self.global_rank]["wall_time_s"]
-        self._passes_done = states[self.global_rank].get("passes_done", self.current_epoch)
-        asked = states[self.global_rank].get("stop_asked", False)
+        own = states[self.global_rank]
+        rng.restore(self.streams, own["streams"])
+        self.take_extra_state(own["extra"])
+        self._seconds_before = own["wall_time_s"]
+        self._passes_done = own.get("passes_done", self.current_epoch)
+        asked = own.get("stop_asked", False)
         at_the_end_of_a_pass = self._passes_done == self.current_epoch
         self._stop_asked = asked and not at_the_end_of_a_pass
         self.trainer.should_stop = asked and at_the_end_of_a_pass
@@ -240,11 +237,7 @@ class StageModule(pl.LightningModule):
         self._seconds_before, self._started_at = self.wall_time_s, None
 
     def on_fit_end(self) -> None:
-        """Make sure that something was trained.
-
-        Raises:
-            NotTrainedError: No optimiser step was taken.
-        """
+        """Raise a NotTrainedError if no optimiser step was taken."""
         if self.trainer.global_step == 0 and not tries(self.trainer):
             raise NotTrainedError(
                 "the stage ended without an optimiser step: its weights are those it began with. A limit of "

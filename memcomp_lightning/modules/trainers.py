@@ -1,7 +1,5 @@
 """Refuses, before anything trains, the settings and callbacks of a trainer that would break a stage."""
 
-from typing import Any
-
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch import callbacks
@@ -22,7 +20,7 @@ _SPELLINGS = {"32": "32-true", "64": "64-true", "None": "32-true"}
 _WHOLE_PASSES = "The batches of a pass make whole updates together. Try fast_dev_run for a short look."
 _OWN_STEPS = "nothing, the stages step their optimisers themselves"
 
-NOT_WITH_STAGES: dict[str, tuple[Any, str, str]] = {
+NOT_WITH_STAGES: dict[str, tuple[object, str, str]] = {
     "limit_train_batches": (1.0, "1.0, every image once a pass", _WHOLE_PASSES),
     "overfit_batches": (0.0, "0.0, every image once a pass", _WHOLE_PASSES),
     "accumulate_grad_batches": (1, _OWN_STEPS, "Use batch_size."),
@@ -53,7 +51,7 @@ _ONLY_LOOK = (
 _NEED_A_LOGGER = (callbacks.DeviceStatsMonitor, callbacks.LearningRateMonitor, callbacks.ThroughputMonitor)
 
 
-def precision_of(value: Any) -> str:
+def precision_of(value: object) -> str:
     """The precision that a value of ``trainer.precision`` means, one of :data:`PRECISIONS`.
 
     Raises:
@@ -76,11 +74,7 @@ def tries(trainer: pl.Trainer) -> bool:
 
 
 def check_trainer(trainer: pl.Trainer) -> None:
-    """Raise unless a stage can be trained by this trainer.
-
-    Raises:
-        SettingError: A setting or a callback would change an update, leave images out, or fail too late.
-    """
+    """Raise a SettingError if a setting or callback would change an update, leave images out, or fail late."""
     precision_of(trainer.precision)
     for name, (neutral, allowed, remedy) in NOT_WITH_STAGES.items():
         value = getattr(trainer, name)
@@ -97,11 +91,7 @@ def check_trainer(trainer: pl.Trainer) -> None:
 
 
 def check_bare_loop(callback: pl.Callback, where: str) -> None:
-    """Raise unless a callback only looks at training, so that a loop without a trainer may leave it out.
-
-    Raises:
-        SettingError: Naming the callback.
-    """
+    """Raise a SettingError unless a callback only looks, so that a loop without a trainer may leave it out."""
     module, name = type(callback).__module__, type(callback).__name__
     ours = module.startswith("memcomp_lightning.callbacks.")
     looks = isinstance(callback, _ONLY_LOOK) or not getattr(callback, "changes_training", not ours)
@@ -111,10 +101,6 @@ def check_bare_loop(callback: pl.Callback, where: str) -> None:
 
 
 def check_callback(callback: pl.Callback, where: str = "callback") -> None:
-    """Raise unless a callback leaves the updates of a stage to the stage.
-
-    Raises:
-        SettingError: Naming the callback.
-    """
+    """Raise a SettingError unless a callback leaves the updates of a stage to the stage."""
     for kind, (allowed, remedy) in _CALLBACKS.items():
         require(not isinstance(callback, kind), where, type(callback).__name__, allowed, remedy)

@@ -1,5 +1,6 @@
 """Weight files: written whole or not at all, read without executing code, refused with the cause."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ class CheckpointError(ValueError):
 
 def save_weights(module: nn.Module, path: Path) -> None:
     """Write the module's state dict; an interruption leaves no half-written file."""
-    _write(module.state_dict(), path)
+    write_tensors(module.state_dict(), path)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -26,12 +27,15 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     the last step is a copy that an interruption can truncate.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
+    ) -> None:
         """Write a checkpoint, or leave the old one."""
-        _write(checkpoint, Path(path))
+        write_tensors(checkpoint, Path(path))
 
 
-def _write(content: Any, path: Path) -> None:
+def write_tensors(content: Mapping[str, object], path: Path) -> None:
+    """Write a file for :func:`torch.load`, whole or not at all, and its folder if there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as partial:
         torch.save(content, partial)
@@ -82,11 +86,9 @@ def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> Non
         raise CheckpointError(f"checkpoint {path} has no tensor {missing[0]!r}: it is of another kind of model.")
     if unknown := sorted(state_dict.keys() - own.keys()):
         raise CheckpointError(f"checkpoint {path} has a tensor {unknown[0]!r} that this model does not have.")
-    for name in own.keys() & state_dict.keys():
-        found = state_dict[name]
-        if not isinstance(found, Tensor):
-            raise CheckpointError(f"checkpoint {path}: {name} is a {type(found).__name__}, expected a tensor.")
     for name, tensor in own.items():
+        if name in state_dict and not isinstance(found := state_dict[name], Tensor):
+            raise CheckpointError(f"checkpoint {path}: {name} is a {type(found).__name__}, expected a tensor.")
         if name in couplings:
             if reason := couplings[name].other_pairs(state_dict.get(name)):
                 raise CheckpointError(f"checkpoint {path}: {reason} Use the model.connectivity it was made with.")
@@ -111,11 +113,7 @@ def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> Non
 
 
 def check_checkpoint(module: nn.Module, path: Path) -> None:
-    """Raise unless a file is a checkpoint of a stage in training with this module.
-
-    Raises:
-        CheckpointError: As :func:`check_fits`, or the file is something else.
-    """
+    """Raise a CheckpointError unless a file is a checkpoint of a stage in training with this module."""
     content = read_checkpoint(path)
     if not {"state_dict", "process_states"} <= content.keys():
         raise CheckpointError(
@@ -129,11 +127,7 @@ def _dtype(tensor: Tensor) -> str:
 
 
 def load_weights(module: nn.Module, path: Path) -> None:
-    """Read a weight file into a module.
-
-    Raises:
-        CheckpointError: The file cannot be read, or does not fit: see :func:`check_fits`.
-    """
+    """Read a weight file into a module; raise a CheckpointError if it does not fit: see :func:`check_fits`."""
     state_dict = read_checkpoint(path)
     check_fits(module, state_dict, path)
     module.load_state_dict(state_dict)

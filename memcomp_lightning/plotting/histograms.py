@@ -13,13 +13,7 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 
 
 def plot_histograms(
-    edges: NDArray[np.floating],
-    counts: Mapping[str, NDArray[np.floating]],
-    *,
-    xlabel: str = "",
-    title: str = "",
-    width: float = 4.2,
-    height: float = 2.6,
+    edges: NDArray[np.floating], counts: Mapping[str, NDArray[np.floating]], *, xlabel: str = ""
 ) -> Figure:
     """Shares of values by bin, a filled step curve for each name.
 
@@ -28,9 +22,6 @@ def plot_histograms(
         counts: Counts or weights of each bin by name, ``(n_bins,)`` each, at most four names; each set is drawn
             as shares of its sum.
         xlabel: Name of the quantity.
-        title: Printed above.
-        width: Inches.
-        height: Inches.
 
     Returns:
         A figure of its own, which pyplot does not know.
@@ -40,7 +31,7 @@ def plot_histograms(
     """
     allowed = f"1 to {len(_COLOURS)} sets of counts"
     require(1 <= len(counts) <= len(_COLOURS), "counts", sorted(counts), allowed)
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(4.2, 2.6), layout="constrained")
     axes = figure.add_subplot()
     for colour, (name, values) in zip(_COLOURS, counts.items(), strict=False):
         axes.stairs(values / values.sum(), edges, fill=True, color=colour, alpha=0.35)
@@ -49,6 +40,4 @@ def plot_histograms(
     axes.set_ylim(bottom=0)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize="small")
-    if title:
-        axes.set_title(title, fontsize="medium", loc="left")
     return figure

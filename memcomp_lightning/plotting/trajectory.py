@@ -10,6 +10,8 @@ from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.solvers.dmm.trajectory import Trajectory
 
+Floats = NDArray[np.float64]
+
 # Okabe and Ito's colours, which colour-blind readers tell apart; they differ in lightness, too.
 _PATH, _BEST, _BOX = "#0072B2", "#D55E00", "0.35"
 
@@ -17,9 +19,7 @@ _CURVES, _CURVES_ALONE = 0.54, 0.88
 """Share of the panel's height that the curves take, with an inset above them and with the legend alone."""
 
 
-def plot_trajectory(
-    trajectory: Trajectory, *, last: int = 3, width: float = 5.2, height: float = 3.6, title: str = ""
-) -> Figure:
+def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -> Figure:
     """Total weight of unsatisfied clauses against machine time (Manukian et al. 2019, Fig. 2).
 
     The restarts follow one another on the time axis, so that each one begins with a spike. The large panel shows
@@ -28,8 +28,6 @@ def plot_trajectory(
     Args:
         trajectory: Of one problem, ``(n_restarts, n_records)``; records of no dwell (not run) are left out.
         last: Number of restarts in the large panel, >= 1.
-        width: Inches.
-        height: Inches.
         title: Printed above.
 
     Returns:
@@ -54,7 +52,7 @@ def plot_trajectory(
     shown = max(n_restarts - last, 0)
     begin, end = float(starts[shown]), float(starts[-1])
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
     axes = figure.add_subplot()
     part = time > begin
     _draw(axes, time[part], weight[part], best[part], linewidth=1.1)
@@ -84,9 +82,7 @@ def plot_trajectory(
     return figure
 
 
-def _one_after_another(
-    trajectory: Trajectory,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _one_after_another(trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
     """Times and weights ``(n_records,)`` of all restarts on one axis; where each begins, and the last one ends."""
     time, weight, dwell = map(to_numpy, (trajectory.time, trajectory.unsatisfied_weight, trajectory.dwell))
     made = dwell > 0
@@ -96,23 +92,9 @@ def _one_after_another(
     return (time + starts[:-1, None])[made], weight[made], starts
 
 
-def _draw(
-    axes: Axes,
-    time: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    best: NDArray[np.float64],
-    *,
-    linewidth: float,
-) -> None:
-    axes.plot(
-        time,
-        best,
-        color=_BEST,
-        linewidth=1.3 * linewidth,
-        linestyle="--",
-        drawstyle="steps-post",
-        label="best so far",
-    )
+def _draw(axes: Axes, time: Floats, weight: Floats, best: Floats, *, linewidth: float) -> None:
+    dashed = {"color": _BEST, "linestyle": "--", "drawstyle": "steps-post"}
+    axes.plot(time, best, linewidth=1.3 * linewidth, label="best so far", **dashed)
     axes.plot(time, weight, color=_PATH, linewidth=linewidth, label="machine")
 
 

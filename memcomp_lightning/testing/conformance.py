@@ -2,19 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, EnergyModel, Gaussian
 from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.problems import Qubo, from_model
-from memcomp_lightning.samplers import NegativePhaseSampler, positive_phase, tensors_of
+from memcomp_lightning.samplers import positive_phase, tensors_of
 from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.solvers import BruteForce, QuboSolver
+from memcomp_lightning.training import Sampler
 from memcomp_lightning.types import Configurations
 
 ModelT = TypeVar("ModelT", RBM, DBM, BoltzmannMachine)
@@ -32,17 +33,16 @@ def small_rbm(
 def small_dbm(*, replicas: tuple[int, ...] = ()) -> DBM:
     """A DBM of 5, 3 and 2 units, biases drawn as those of :func:`small_rbm`."""
     generator = rng.stream(0, "test model")
-    return _with_biases(
-        DBM(5, [3, 2], replicas=replicas, weight_init=Gaussian(std=0.8), generator=generator), generator
-    )
+    dbm = DBM(5, [3, 2], replicas=replicas, weight_init=Gaussian(std=0.8), generator=generator)
+    return _with_biases(dbm, generator)
 
 
 def small_machine(*, replicas: tuple[int, ...] = ()) -> BoltzmannMachine:
     """A Boltzmann machine of 4 visible and 3 hidden units, all but one pair coupled, with biases."""
     generator = rng.stream(0, "test model")
-    pairs = full(7)[1:]
-    settings: dict[str, Any] = {"replicas": replicas, "weight_init": Gaussian(std=0.5), "generator": generator}
-    return _with_biases(BoltzmannMachine(4, 3, pairs, **settings), generator)
+    pairs, init = full(7)[1:], Gaussian(std=0.5)
+    machine = BoltzmannMachine(4, 3, pairs, replicas=replicas, weight_init=init, generator=generator)
+    return _with_biases(machine, generator)
 
 
 def _with_biases(model: ModelT, generator: Generator) -> ModelT:
@@ -53,7 +53,7 @@ def _with_biases(model: ModelT, generator: Generator) -> ModelT:
 
 
 def check_sampler(
-    sampler: NegativePhaseSampler[Any, Any], *, n_data: int = 11, make: Callable[..., Any] = small_rbm
+    sampler: Sampler, *, n_data: int = 11, make: Callable[..., RBM | DBM | BoltzmannMachine] = small_rbm
 ) -> None:
     """Run a sampler on small models with and without replica axes and check the contract.
 
@@ -126,9 +126,7 @@ def _check_frozen(sampler: object) -> None:
         _check(False, f"{type(sampler).__name__}: the setting {setting!r} can be changed; freeze the class")
 
 
-def _check_declarations(
-    sampler: NegativePhaseSampler[Any, Any], rbm: Any, v_data: Tensor, answer: Configurations
-) -> None:
+def _check_declarations(sampler: Sampler, rbm: EnergyModel, v_data: Tensor, answer: Configurations) -> None:
     """``uses_data`` and ``shared`` are there, and a sampler that denies using the data does not."""
     name = type(sampler).__name__
     for attribute in ("uses_data", "shared"):
@@ -140,7 +138,7 @@ def _check_declarations(
         _check(other.v.equal(answer.v), f"{name} says uses_data = False, but other data give another answer")
 
 
-def _check_configurations(name: str, configurations: Configurations, rbm: Any) -> None:
+def _check_configurations(name: str, configurations: Configurations, rbm: EnergyModel) -> None:
     v, h, weight = configurations
     _check(v.shape[:-2] == rbm.replicas, f"{name}: v has shape {tuple(v.shape)}, replicas are {rbm.replicas}")
     _check(v.shape[-1] == rbm.n_visible, f"{name}: last axis of v is {v.shape[-1]}, not {rbm.n_visible}")
@@ -166,9 +164,8 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
         AssertionError: Naming what the solver got wrong.
     """
     name = type(solver).__name__
-    plain: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
-    matrix = torch.empty(7, 7, **plain).normal_(generator=rng.stream(3, "matrix"))
-    batch = torch.empty(2, 3, 5, 5, **plain).normal_(generator=rng.stream(4, "matrix"))
+    matrix = torch.empty(7, 7, dtype=torch.float32, device="cpu").normal_(generator=rng.stream(3, "matrix"))
+    batch = torch.empty(2, 3, 5, 5, dtype=torch.float32, device="cpu").normal_(generator=rng.stream(4, "matrix"))
     problems = {
         "RBM": from_model(small_rbm()),
         "two axes of RBMs": from_model(small_rbm(replicas=(2, 3))),

@@ -22,10 +22,6 @@ def diverged_parameter(module: nn.Module, largest_allowed: float = LARGEST_WEIGH
 
 
 def require_finite(module: nn.Module, where: str) -> None:
-    """Raise if a parameter left the finite numbers.
-
-    Raises:
-        DivergedError: Naming the parameter.
-    """
+    """Raise a DivergedError if a parameter left the finite numbers, and name it."""
     if (diverged := diverged_parameter(module)) is not None:
         raise DivergedError(f"{where}: {diverged}. Lower the learning rate.")

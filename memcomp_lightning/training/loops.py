@@ -103,14 +103,8 @@ class PhaseTraining:
 
     Args:
         phase: The energy model, trained in place, and what it sees.
-        sampler: Supplies the negative phase.
-        optimizer: Builds the optimiser.
-        schedules: Change the optimiser from pass to pass.
-        centring: Settings of the centred gradient; None follows the plain one.
+        sampler, optimizer, schedules, centring: As for :func:`pretrain`.
         streams: Generators by the names "negative_phase" and "positive_phase".
-
-    Attributes:
-        passes_done: How many.
     """
 
     def __init__(
@@ -163,13 +157,7 @@ class ClassifierTraining:
     """Trains one network pass by pass, and keeps its optimiser in between.
 
     Args:
-        network: Maps inputs ``(*replicas, n, n_visible)`` to logits; trained in place.
-        optimizer: Builds the optimiser.
-        schedules: Change the optimiser from pass to pass.
-        loss: Of each image.
-
-    Attributes:
-        passes_done: How many.
+        network, optimizer, schedules, loss: As for :func:`finetune`.
     """
 
     def __init__(
@@ -234,14 +222,14 @@ def finetune(
     for iteration in range(iterations):
         batches.set_epoch(iteration)
         training.run_pass(batches)
-        newest = None
-        if keep_best_by is not None:
-            best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
-            newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
-            network.load_state_dict(best.weights)
+        if keep_best_by is None:
+            yield iteration + 1
+            continue
+        best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
+        newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+        network.load_state_dict(best.weights)
         yield iteration + 1
-        if newest is not None:
-            network.load_state_dict(newest)
+        network.load_state_dict(newest)
     require_finite(network, "fine-tuning")
     if best.weights:
         network.load_state_dict(best.weights)

@@ -27,11 +27,7 @@ class Schedule(Protocol):
     """Changes an optimiser at the start of each pass."""
 
     def check(self, optimizer: Optimizer) -> None:
-        """Refuse an optimiser without the settings that this schedule changes.
-
-        Raises:
-            SettingError: Naming the optimiser.
-        """
+        """Raise a SettingError for an optimiser without the settings that this schedule changes."""
         ...
 
     def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
@@ -70,14 +66,10 @@ class MomentumSchedule:
             "Leave the schedule out: pretrain.schedules.momentum=null, finetune.schedules.momentum=null.",
         )
 
-    def momentum(self, iteration: int) -> float:
-        """Momentum of a pass."""
-        return self.initial if iteration < self.switch_at else self.final
-
     def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
         """Set the momentum of the pass."""
         for group in optimizer.param_groups:
-            group["momentum"] = self.momentum(iteration)
+            group["momentum"] = self.initial if iteration < self.switch_at else self.final
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class EnergyStep:
             model: The energy model; not changed.
             positive: The positive phase of the batch, with its weights.
             state: What the call before returned, ``after_update()`` where the update was complete.
-            generator: Random stream of the negative phase.
+            generator: Of the negative phase.
         """
         offsets, negative = state.offsets, state.negative
         if negative is None and self.centring is not None:

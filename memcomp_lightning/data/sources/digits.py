@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from sklearn.datasets import load_digits
 from sklearn.model_selection import train_test_split
@@ -38,17 +39,7 @@ class Digits(GreySource):
         v = without_corners(torch.from_numpy(digits.images)[:, 1:-1, 1:-1].float() / 16)
         label = torch.from_numpy(digits.target).long()
         train, test = train_test_split(
-            torch.arange(len(label), device="cpu").numpy(),
-            test_size=0.2,
-            stratify=label.numpy(),
-            random_state=self.split_seed,
+            np.arange(len(label)), test_size=0.2, stratify=label.numpy(), random_state=self.split_seed
         )
-        return ImageData(
-            train_v=v[train],
-            train_label=label[train],
-            test_v=v[test],
-            test_label=label[test],
-            n_classes=10,
-            layout=SIX_BY_SIX_WITHOUT_CORNERS,
-            name="digits",
-        )
+        layout = SIX_BY_SIX_WITHOUT_CORNERS
+        return ImageData(v[train], label[train], v[test], label[test], n_classes=10, layout=layout, name="digits")

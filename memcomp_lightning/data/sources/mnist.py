@@ -31,12 +31,9 @@ class Mnist(GreySource):
 
     def load_grey(self) -> ImageData:
         """Return the images in grey."""
-        arrays = mnist_files.read(self.data_dir, download=self.download)
-        train_v, test_v = (
-            self.inputs(images.to(torch.float32).div_(255)) for images in (arrays.train_images, arrays.test_images)
-        )
-        labels = arrays.train_labels.long(), arrays.test_labels.long()
-        return ImageData(train_v, labels[0], test_v, labels[1], 10, self.layout, self.name)
+        (train, train_label), (test, test_label) = mnist_files.read(self.data_dir, download=self.download)
+        train_v, test_v = (self.inputs(images.to(torch.float32).div_(255)) for images in (train, test))
+        return ImageData(train_v, train_label.long(), test_v, test_label.long(), 10, self.layout, self.name)
 
     @staticmethod
     def inputs(images: Float[Tensor, "n 28 28"]) -> Float[Tensor, "n n_visible"]:

@@ -42,8 +42,6 @@ class ShiftingBars:
         pixel = torch.arange(self.n_pixels, device="cpu")
         offset = (pixel - pixel[:, None]) % self.n_pixels
         v = ((offset < self.bar_length) ^ self.inverted).float()
-        layout, name = (
-            PixelLayout(height=1, width=self.n_pixels),
-            "inverted_bars" if self.inverted else "shifting_bars",
-        )
+        name = "inverted_bars" if self.inverted else "shifting_bars"
+        layout = PixelLayout(height=1, width=self.n_pixels)
         return same_patterns(v, pixel, self.n_pixels, layout, name, self.copies)

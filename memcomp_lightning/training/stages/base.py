@@ -62,11 +62,7 @@ class PretrainingStage(Protocol):
 
 
 def check_stage(stage: PretrainingStage, sampler: NegativePhaseSampler[Any, Any], seed: int) -> None:
-    """Refuse what is no stage, and models that a sampler cannot handle, before anything is trained.
-
-    Raises:
-        SettingError: Of the stage or the sampler.
-    """
+    """Raise a SettingError for what is no stage, and models that a sampler cannot handle, before training."""
     require_parts("stage", stage, "way of pretraining", ("network", "phases", "hand_over"))
     for phase in stage.phases:
         require_state(sampler.init(phase.model, 1, generator=rng.stream(seed, "check")))

@@ -22,9 +22,13 @@ class Boltzmann:
     """
 
     def __init__(self, network: BoltzmannMachine, *, positive: PositivePhaseSampler | None = None) -> None:
-        kind, remedy = type(network).__name__, "For a DBN use pretrain=greedy, centred or joint."
-        fits = isinstance(network, BoltzmannMachine)
-        require(fits, "pretrained network", kind, "a Boltzmann machine", remedy)
+        require(
+            isinstance(network, BoltzmannMachine),
+            "pretrained network",
+            type(network).__name__,
+            "a Boltzmann machine",
+            "For a DBN use pretrain=greedy, centred or joint.",
+        )
         self.network = network
         positive_of = partial(sampled, positive or MeanField(), network)
         self.phases = [Phase(name="jointly", tag="", model=network, positive=positive_of)]

@@ -32,11 +32,7 @@ class Greedy:
 
 
 def require_dbn(network: object) -> None:
-    """Refuse everything else.
-
-    Raises:
-        SettingError: Naming what it is.
-    """
+    """Raise a SettingError for everything else."""
     remedy = "For a Boltzmann machine use pretrain=boltzmann."
     require(isinstance(network, DBN), "pretrained network", type(network).__name__, "a DBN", remedy)
 
