@@ -11,12 +11,7 @@ from memcomp_lightning.models import EnergyModel
 
 
 class _MeanOverImages(Metric):
-    """Sum and number of values, ``(*replicas,)`` each.
-
-    Args:
-        replicas: Leading axes of the model.
-        settings: Those of :class:`torchmetrics.Metric`.
-    """
+    """Sum and number of values, ``(*replicas,)`` each."""
 
     full_state_update = False
     higher_is_better = True
@@ -40,29 +35,24 @@ class _MeanOverImages(Metric):
 
 
 class MeanLogLikelihood(_MeanOverImages):
-    """Mean of ``log p(v)`` over images, nats: ``update(model, v, log_z)``."""
+    """Mean of ``log p(v)`` over images, nats: ``update(model, v, log_z)``.
+
+    ``replicas`` are the leading axes of the model.
+    """
 
     @torch.no_grad()
     def update(self, model: EnergyModel, v: Tensor, log_z: Tensor) -> None:
-        """Add a batch.
-
-        Args:
-            model: The energy model.
-            v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
-            log_z: Logarithm of the model's partition function, ``(*replicas,)``.
-        """
+        """Add images in {0, 1}, ``(*replicas, n, n_visible)``; ``log_z`` is the model's, ``(*replicas,)``."""
         self._add(log_likelihood(model, v, log_z))
 
 
 class MeanLogPseudoLikelihood(_MeanOverImages):
-    """Mean over images of ``sum_j log p(v_j | all other v)``, nats: ``update(model, v)``. It needs no log Z."""
+    """Mean over images of ``sum_j log p(v_j | all other v)``, nats: ``update(model, v)``. It needs no log Z.
+
+    ``replicas`` are the leading axes of the model.
+    """
 
     @torch.no_grad()
     def update(self, model: EnergyModel, v: Tensor) -> None:
-        """Add a batch.
-
-        Args:
-            model: The energy model.
-            v: Images in {0, 1}, ``(*replicas, n, n_visible)``.
-        """
+        """Add images in {0, 1}, ``(*replicas, n, n_visible)``."""
         self._add(log_pseudo_likelihood(model, v).sum(-1))

@@ -79,11 +79,7 @@ def iteration_of(module: pl.LightningModule) -> int:
 
 
 def model_of(module: pl.LightningModule) -> ShownModel:
-    """The energy model in training.
-
-    Raises:
-        TypeError: The module has no attribute ``model``, or it is no energy model.
-    """
+    """The energy model in training; raise a TypeError if the module has none as its ``model``."""
     model = getattr(module, "model", None)
     if not hasattr(model, "energy"):
         has = "no attribute 'model'" if model is None else f"a {type(model).__name__} as its 'model'"
@@ -136,21 +132,12 @@ def write_picture(trainer: pl.Trainer, module: pl.LightningModule, tag: str, pic
 
 
 def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_units: int) -> None:
-    """Refuse models that are too large to enumerate (``n_enumerated``): all of the module's, before training.
-
-    Raises:
-        SettingError: Naming callback and size.
-    """
+    """Raise a SettingError for models that are too large to enumerate: any of the module's, before training."""
     for model in getattr(module, "models", None) or [model_of(module)]:
-        n_units = model.n_enumerated
-        name = type(callback).__name__
-        require(
-            n_units <= max_units,
-            f"units to enumerate for {name}",
-            n_units,
-            f"at most {max_units} units, because all their states are enumerated",
-            f"Leave {name} out, or train a model with a smaller layer.",
-        )
+        n_units, name = model.n_enumerated, type(callback).__name__
+        allowed = f"at most {max_units} units, because all their states are enumerated"
+        remedy = f"Leave {name} out, or train a model with a smaller layer."
+        require(n_units <= max_units, f"units to enumerate for {name}", n_units, allowed, remedy)
 
 
 class LastImages:
@@ -164,10 +151,6 @@ class LastImages:
         require_count("n_images", n)
         self.n = n
         self._batches: list[Tensor] = []
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._batches = []
 
     def add(self, v: Tensor) -> None:
         """Keep references to the images ``(*replicas, n, n_visible)`` of a batch."""
@@ -225,11 +208,7 @@ def images_of_step(outputs: object, callback: pl.Callback) -> Tensor:
 
 
 def required(outputs: object, callback: pl.Callback, *keys: str) -> StepOutputs:
-    """Return what a step returned.
-
-    Raises:
-        TypeError: It is no dictionary, or lacks one of the keys.
-    """
+    """Return what a step returned; raise a TypeError if it is no dictionary or lacks one of the keys."""
     for key in keys:
         if not isinstance(outputs, Mapping) or key not in outputs:
             raise TypeError(

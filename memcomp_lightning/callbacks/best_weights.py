@@ -13,10 +13,9 @@ from memcomp_lightning.training import BestPass, Score
 class BestWeights(pl.Callback):
     """Keeps the weights of the pass with the highest accuracy on held-out images, and puts them back at the end.
 
-    Works with any module whose ``validation_step`` returns a dictionary with ``score``
-    (:class:`memcomp_lightning.training.Score`). Each replica keeps its own best pass, so parameters must begin
-    with the replica axes, which are those of the accuracy. Of equal passes the first one stays. Checkpoints hold
-    the weights kept so far.
+    It goes by the ``score`` that ``validation_step`` returns. Each replica keeps its own best pass, so parameters
+    must begin with the replica axes, which are those of the accuracy. Of equal passes the first one stays.
+    Checkpoints hold the weights kept so far.
     """
 
     def __init__(self) -> None:

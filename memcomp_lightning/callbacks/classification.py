@@ -11,11 +11,8 @@ class ClassificationMetrics(pl.Callback):
 
     The names are ``loss``, ``accuracy``, ``heldout_loss``, ``heldout_accuracy``, ``test_loss``, ``test_accuracy``.
 
-    Works with any module whose ``training_step``, ``validation_step`` and ``test_step`` return a dictionary
-    with ``score`` (:class:`memcomp_lightning.training.Score`). The values of each replica stay in ``latest``.
-
     Attributes:
-        latest: The newest score of each kind: "train", "heldout", "test".
+        latest: The newest score of each kind, "train", "heldout" and "test", with the values of each replica.
     """
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ class FreeEnergyGap(pl.Callback):
 
     def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
-        self._train.clear()
+        self._train = LastImages(self.n_images)
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object

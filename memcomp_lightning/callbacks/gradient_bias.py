@@ -30,9 +30,6 @@ class GradientBias(EveryIterations):
     All states of the smaller layer are held at once: for each replica 2^(its units) rows, each as long as the
     larger layer.
 
-    Args:
-        every: Passes between two values, >= 1.
-
     Raises:
         SettingError: At the start of training, if a smaller layer has more than 16 units.
     """

@@ -7,11 +7,7 @@ from memcomp_lightning.callbacks.base import EveryIterations, prefix_of, tensorb
 
 
 class ParameterHistograms(EveryIterations):
-    """Writes a TensorBoard histogram of each parameter, over all replicas.
-
-    Args:
-        every: Passes between two histograms, >= 1.
-    """
+    """Writes a TensorBoard histogram of each parameter, over all replicas."""
 
     def __init__(self, every: int = 10) -> None:
         super().__init__(every)

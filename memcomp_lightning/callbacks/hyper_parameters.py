@@ -10,10 +10,10 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 def write_hyper_parameters(
     loggers: Iterable[Logger], settings: Mapping[str, Any], metrics: Mapping[str, float]
 ) -> None:
-    """Hand settings and final metrics to the loggers.
+    """Hand settings and final metrics to the loggers; those other than TensorBoard get them apart.
 
     Args:
-        loggers: Lightning loggers; those other than TensorBoard get settings and metrics apart.
+        loggers: Lightning loggers.
         settings: Nested settings, plain values; become ``group/name`` in the HParams tab.
         metrics: Final metrics by tag.
     """
@@ -31,8 +31,7 @@ class HyperParameters(pl.Callback):
 
     Args:
         settings: Nested settings, plain values.
-        metrics: Names of logged metrics to show beside them as ``final/<name>``; those that were not logged are
-            left out.
+        metrics: Names of metrics to show beside them as ``final/<name>``, if they were logged.
     """
 
     def __init__(self, settings: Mapping[str, Any], metrics: Sequence[str]) -> None:

@@ -115,7 +115,7 @@ class LogLikelihood(EveryIterations):
 
     def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
-        self._train.clear()
+        self._train = LastImages(self._train.n)
         self._heldout = []
 
     def on_train_batch_end(

@@ -11,9 +11,6 @@ class NegativePhaseEnergies(EveryIterations):
     ``contrast`` is the loss of the pass's last update, before its step. ``energy_data``, ``energy_model`` and
     ``energy_model_lowest`` are energies of the same states under the updated model. :class:`EnergyHistograms`
     draws how they are distributed; :class:`SamplerDiagnostics` logs what the sampler reports.
-
-    Args:
-        every: Passes between two values, >= 1.
     """
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:

@@ -1,28 +1,20 @@
 """A grid of pictures of the inputs in TensorBoard: base of the callbacks that draw some."""
 
 from abc import abstractmethod
-from typing import Protocol
 
 import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import EveryIterations, tensorboards, write_picture
+from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
-
-
-class Layout(Protocol):
-    """Where visible units lie in a picture; the data module's ``pixel_layout``."""
-
-    def to_picture(self, v: Tensor) -> Tensor:
-        """Picture ``(*leading, height, width)`` of visible states ``(*leading, n_visible)``."""
-        ...
 
 
 class Pictures(EveryIterations):
     """Writes one picture grid of the first replica every so many passes.
 
-    The data module's ``pixel_layout`` says where each input lies; without one nothing is drawn.
+    The data module's ``pixel_layout`` says by ``to_picture`` where each input lies; without one nothing is drawn.
 
     Args:
         tag: Name of the picture, after stage and layer.
@@ -42,7 +34,7 @@ class Pictures(EveryIterations):
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Draw the grid."""
-        layout: Layout | None = getattr(getattr(trainer, "datamodule", None), "pixel_layout", None)
+        layout: PixelLayout | None = getattr(getattr(trainer, "datamodule", None), "pixel_layout", None)
         if layout is None or not tensorboards(trainer):
             return
         tiles = self.tiles(pl_module, outputs)

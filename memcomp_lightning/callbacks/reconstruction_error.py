@@ -9,9 +9,6 @@ class ReconstructionError(EveryIterations):
     """Logs ``reconstruction_error``, the mean of ``(v - E[v | E[h | v]])^2`` over units and images.
 
     It is cheap and says that training runs; it is no measure of likelihood (Hinton 2010, section 5).
-
-    Args:
-        every: Passes between two values, >= 1.
     """
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:

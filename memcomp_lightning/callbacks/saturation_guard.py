@@ -65,11 +65,7 @@ class SaturationGuard(pl.Callback):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
     ) -> None:
-        """Judge the pass after its last update.
-
-        Raises:
-            DivergedError: It is time to stop.
-        """
+        """Judge the pass after its last update."""
         if not trainer.is_last_batch:
             return
         where = f"pass {iteration_of(pl_module) + 1} of {prefix_of(pl_module)}"

@@ -14,9 +14,6 @@ class Schedules(pl.Callback):
 
     Args:
         schedules: :class:`memcomp_lightning.training.MomentumSchedule` and others.
-
-    Raises:
-        SettingError: When training starts: an optimiser that a schedule cannot change.
     """
 
     changes_training = True
@@ -25,7 +22,7 @@ class Schedules(pl.Callback):
         self.schedules = schedules
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Check the optimisers."""
+        """Raise a SettingError for an optimiser that a schedule cannot change."""
         check_schedules(self.schedules, trainer.optimizers)
 
     def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:

@@ -25,21 +25,14 @@ class TrajectoryFigure(EveryIterations):
         solver: Records its trajectory; None is ``DmmSolver(n_restarts=3, record=Recording(every=1))``.
         last: Restarts in the large panel, >= 1.
         seed: Seed of the machine's start.
-
-    Raises:
-        SettingError: The solver records no trajectory.
     """
 
     def __init__(self, every: int = 100, solver: QuboSolver | None = None, last: int = 3, seed: int = 0) -> None:
         super().__init__(every)
         self.solver = DmmSolver(n_restarts=3, record=Recording(every=1)) if solver is None else solver
-        require(
-            getattr(self.solver, "record", None) is not None,
-            "solver",
-            type(self.solver).__name__,
-            "a solver that records its trajectory, for TrajectoryFigure",
-            "Use DmmSolver(record=Recording(every=1)).",
-        )
+        records = getattr(self.solver, "record", None) is not None
+        wanted, remedy = "a solver that records its trajectory", "Use DmmSolver(record=Recording(every=1))."
+        require(records, "solver", type(self.solver).__name__, f"{wanted}, for TrajectoryFigure", remedy)
         require_count("last", last)
         self.last = last
         self.seed = seed

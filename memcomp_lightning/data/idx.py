@@ -5,7 +5,6 @@ import hashlib
 import math
 import struct
 import zlib
-from pathlib import Path
 
 import torch
 from jaxtyping import UInt8
@@ -17,20 +16,6 @@ _UNSIGNED_BYTE = 0x08
 
 class CorruptFileError(ValueError):
     """A data file whose bytes are not what they must be."""
-
-
-def read_bytes(path: Path, md5: str) -> bytes:
-    """Return the bytes of a file, uncompressed if its name ends in ``.gz``.
-
-    Args:
-        path: The file.
-        md5: MD5 of the *uncompressed* bytes: the same file has been packed in more than one way.
-
-    Raises:
-        CorruptFileError: The file is truncated, or its bytes are others.
-    """
-    data = path.read_bytes()
-    return checked(unpacked(data, str(path)) if path.suffix == ".gz" else data, md5, str(path))
 
 
 def unpacked(data: bytes, source: str) -> bytes:

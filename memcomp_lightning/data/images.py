@@ -64,9 +64,6 @@ class ImageData:
         n_classes: Number of classes; labels run from 0 to ``n_classes - 1``.
         layout: Where the visible units lie in the picture.
         name: Name of the data set, for reports.
-
-    Raises:
-        SettingError: A tensor has another type or shape, is empty, or holds a value out of range.
     """
 
     train_v: Tensor

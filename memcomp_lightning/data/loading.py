@@ -71,15 +71,10 @@ class Batches:
         batch_size: Images of a replica in an optimiser step, over all processes, >= 1; the last step of a
             pass takes what is left. None, or n and more, means all n.
         chunk_size: Images of a replica that one Batch holds at most, >= 1.
-        shuffle: Whether each epoch has another order.
-        seed: Seed of the order.
-        rank: Index of this process.
-        world_size: Number of processes.
+        shuffle, seed: Whether each epoch has another order, and its seed.
+        rank, world_size: Index of this process, and how many there are.
         weight: How often each image counts in the mean over a step, > 0, ``(n,)``, without replica axes; None
             means once each.
-
-    Raises:
-        SettingError: A setting is out of range, or a step leaves a process without images.
 
     >>> batches = Batches(torch.zeros(7, 2), torch.zeros(7).long(), 3, chunk_size=2, shuffle=True, seed=0)
     >>> [(len(batch.label), batch.closes_step) for batch in batches]
@@ -238,20 +233,12 @@ def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size
         step = range(start, min(start + (batch_size or n), n))
         n_chunks = math.ceil(math.ceil(len(step) / world_size) / chunk_size)
         # An empty chunk is refused: the mean over it is NaN.
-        require(
-            len(step) >= world_size,
-            "batch_size",
-            batch_size,
-            f"at least one image for each process in every step, but a step has {len(step)} images for "
-            f"{world_size} processes",
-            "Choose a batch_size that leaves more in the last step, or use fewer processes.",
-        )
-        require(
-            len(step) // world_size >= n_chunks,
-            "chunk_size",
-            chunk_size,
-            f"an integer >= 2, because {world_size} processes share a step of {len(step)} images unevenly",
-        )
+        allowed = f"at least one image for each process in every step, but a step has {len(step)} images for "
+        allowed += f"{world_size} processes"
+        remedy = "Choose a batch_size that leaves more in the last step, or use fewer processes."
+        require(len(step) >= world_size, "batch_size", batch_size, allowed, remedy)
+        allowed = f"an integer >= 2, because {world_size} processes share a step of {len(step)} images unevenly"
+        require(len(step) // world_size >= n_chunks, "chunk_size", chunk_size, allowed)
         shard = step[rank::world_size]
         bounds = [k * len(shard) // n_chunks for k in range(n_chunks + 1)]
         for k in range(n_chunks):

@@ -27,7 +27,7 @@ MD5 = {
     "t10k-images-idx3-ubyte": "2646ac647ad5339dbf082846283269ea",
     "t10k-labels-idx1-ubyte": "27ae3e4e09519cfbb04c329615203637",
 }
-"""MD5 of the uncompressed bytes of each file."""
+"""MD5 of the *uncompressed* bytes of each file: the same file has been packed in more than one way."""
 
 ATTEMPTS = 2
 """How often a download asks all mirrors."""
@@ -97,8 +97,10 @@ def _read_pair(folder: Path, subset: str) -> Labelled:
 def _read_array(folder: Path, name: str, n_axes: int) -> Tensor:
     # A file that another process removes in this moment raises FileNotFoundError with its own name.
     path = _find(folder, name) or folder / name
+    data, source = path.read_bytes(), str(path)
     try:
-        return idx.parse(idx.read_bytes(path, MD5[name]), n_axes, str(path))
+        data = idx.checked(idx.unpacked(data, source) if path.suffix == ".gz" else data, MD5[name], source)
+        return idx.parse(data, n_axes, source)
     except idx.CorruptFileError as error:
         raise idx.CorruptFileError(f"{error} Delete the file: the next run fetches it again.") from error
 

@@ -40,9 +40,6 @@ class ImageDataModule(LightningDataModule):
         chunk_size: Images of a replica in one Batch at most, >= 1: bounds the memory of large steps.
         seed: Seed of the order in which training images come.
         partition_seed: Seed of the partition and of the held-out images.
-
-    Raises:
-        SettingError: A setting is out of range for these images.
     """
 
     def __init__(

@@ -21,10 +21,7 @@ def reduce_images(images: Tensor) -> Float[Tensor, "n 32"]:
         images: Intensities in [0, 1], ``(n, 28, 28)``.
 
     Returns:
-        Intensities in [0, 1], ``(n, 32)``, in the order of :data:`SIX_BY_SIX_WITHOUT_CORNERS`.
-
-    Raises:
-        SettingError: The images are not 28 x 28.
+        ``(n, 32)``, in the order of :data:`SIX_BY_SIX_WITHOUT_CORNERS`.
 
     >>> import torch
     >>> reduce_images(torch.ones(2, 28, 28)).shape

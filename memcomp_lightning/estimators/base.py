@@ -141,26 +141,15 @@ def sgd(learning_rate: float, momentum: float = 0.0, name: str = "learning_rate"
     return partial(SGD, lr=learning_rate, momentum=momentum)
 
 
-class Drawn:
-    """N(0, std^2) in a given precision, whatever torch's default one is.
-
-    Args:
-        std: Standard deviation, >= 0.
-        dtype: Of the weights.
-    """
-
-    def __init__(self, std: float, dtype: torch.dtype) -> None:
-        self._std, self._dtype = std, dtype
-
-    def __call__(self, shape: tuple[int, ...], *, generator: Generator) -> Tensor:
-        """Return a tensor of this shape."""
-        return torch.empty(shape, dtype=self._dtype).normal_(0.0, self._std, generator=generator)
+def drawn(shape: tuple[int, ...], *, std: float, dtype: torch.dtype, generator: Generator) -> Tensor:
+    """Draw from N(0, std^2) in a given precision, whatever torch's default one is."""
+    return torch.empty(shape, dtype=dtype).normal_(0.0, std, generator=generator)
 
 
 def dbn_for(X: Matrix, sizes: list[int], *, std: float, generator: Generator) -> DBN:
     """Return an untrained network in the precision of the data."""
     dtype = torch.float64 if X.dtype == np.float64 else torch.float32
-    return DBN(X.shape[1], sizes, weight_init=Drawn(std, dtype), generator=generator).to(dtype)
+    return DBN(X.shape[1], sizes, weight_init=partial(drawn, std=std, dtype=dtype), generator=generator).to(dtype)
 
 
 def in_precision_of(X: Matrix, module: ModuleT) -> tuple[Matrix, ModuleT]:

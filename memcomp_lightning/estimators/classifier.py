@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from numbers import Real
 from typing import Literal, Self, cast
 
@@ -27,10 +28,10 @@ from memcomp_lightning.defaults import (
 )
 from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.estimators.base import (
-    Drawn,
     MemcompEstimator,
     array_of,
     dbn_for,
+    drawn,
     in_precision_of,
     seed_of,
     sgd,
@@ -240,7 +241,7 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         )
         for _ in passes:
             pass
-        output_init = Drawn(self.weight_std, dbn[0].weight.dtype)
+        output_init = partial(drawn, std=self.weight_std, dtype=dbn[0].weight.dtype)
         generator = rng.stream(seed, "output weights")
         n_classes = len(self.classes_)
         self.network_ = DBNClassifier(

@@ -44,11 +44,7 @@ class Samples(NamedTuple):
 
     @classmethod
     def that_count(cls, X: Matrix, label: Array, sample_weight: ArrayLike | None) -> "Samples":
-        """Return the samples whose weight is not 0.
-
-        Raises:
-            ValueError: The number of weights is wrong, one is negative or not finite, or all are zero.
-        """
+        """Return the samples whose weight is not 0; raise a ValueError if the weights are wrong, or all zero."""
         if sample_weight is None:
             return cls(X, label)
         weight: Array = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)

@@ -76,9 +76,6 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
 
     Attributes:
         rbm_: The trained :class:`memcomp_lightning.models.RBM`.
-        components_: Its weights, ``(n_components, n_features)``.
-        intercept_hidden_: Hidden biases.
-        intercept_visible_: Visible biases.
         n_iter_: Passes done.
         validation_scores_: Score of the held-out samples after each pass; None without ``early_stopping``.
 

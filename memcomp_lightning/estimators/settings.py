@@ -24,7 +24,7 @@ class NestedSettings(BaseEstimator):  # type: ignore[misc]
         params: dict[str, Any] = super().get_params(deep=deep)
         if deep:
             for name, value in list(params.items()):
-                params |= _listed(name, self._meant(name, value))
+                params |= _listed(name, self._negative_phase() if name == "sampler" else value)
         return params
 
     def set_params(self, **params: Any) -> "NestedSettings":
@@ -41,7 +41,7 @@ class NestedSettings(BaseEstimator):  # type: ignore[misc]
             if nests:
                 nested.setdefault(outer, {})[inner] = value
         for outer, values in nested.items():
-            held = self._meant(outer, getattr(self, outer, None))
+            held = self._negative_phase() if outer == "sampler" else getattr(self, outer, None)
             if _is_settings(held):
                 setattr(self, outer, _replaced(outer, held, values))
             elif hasattr(self, outer) and not hasattr(held, "set_params"):
@@ -50,9 +50,6 @@ class NestedSettings(BaseEstimator):  # type: ignore[misc]
             else:
                 super().set_params(**{f"{outer}__{inner}": value for inner, value in values.items()})
         return self
-
-    def _meant(self, name: str, value: Any) -> Any:
-        return self._default_sampler() if name == "sampler" and value is None else value
 
 
 def _is_settings(value: object) -> bool:

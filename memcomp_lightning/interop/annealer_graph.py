@@ -1,6 +1,6 @@
 """Connectivity of quantum annealers, for Boltzmann machines that fit on one."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Int
@@ -30,23 +30,6 @@ def annealer_graph(kind: Kind, size: int, n_visible: int) -> Int[Tensor, "n_pair
     require_choice("kind", kind, ("chimera", "pegasus", "zephyr"))
     require_count("size", size, minimum=2 if kind == "pegasus" else 1)
     require_count("n_visible", n_visible)
-    graph = getattr(_dwave_graphs(), f"{kind}_graph")(size)
-    pairs, n_units = from_graph(graph), graph.number_of_nodes()
-    require(
-        n_visible < n_units,
-        "n_visible",
-        n_visible,
-        f"less than the {n_units} units of {kind} graph {size}",
-        "Raise size, or take data with fewer inputs.",
-    )
-    visible = torch.arange(n_visible) * n_units // n_visible
-    hidden = torch.arange(n_units)[~torch.isin(torch.arange(n_units), visible)]
-    number = torch.empty(n_units, dtype=torch.long)
-    number[torch.cat((visible, hidden))] = torch.arange(n_units)
-    return from_pairs(n_units, number[pairs])
-
-
-def _dwave_graphs() -> Any:
     try:
         from dwave import graphs
     except ImportError:
@@ -54,4 +37,12 @@ def _dwave_graphs() -> Any:
             "Graphs of annealers come from dwave-graphs, which is not installed: "
             "pip install 'memcomp-lightning[dimod]'."
         ) from None
-    return graphs
+    graph = getattr(graphs, f"{kind}_graph")(size)
+    pairs, n_units = from_graph(graph), graph.number_of_nodes()
+    allowed = f"less than the {n_units} units of {kind} graph {size}"
+    require(n_visible < n_units, "n_visible", n_visible, allowed, "Raise size, or take data with fewer inputs.")
+    visible = torch.arange(n_visible) * n_units // n_visible
+    hidden = torch.arange(n_units)[~torch.isin(torch.arange(n_units), visible)]
+    number = torch.empty(n_units, dtype=torch.long)
+    number[torch.cat((visible, hidden))] = torch.arange(n_units)
+    return from_pairs(n_units, number[pairs])

@@ -1,6 +1,7 @@
 """The DMM as a ``dimod.Sampler``: for whoever has a binary quadratic model and dimod's tools."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -61,8 +62,9 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
             given: Anything else is reported by a warning, as dimod's samplers do.
         """
         self.remove_unknown_kwargs(**given)
+        sample_set: Callable[..., SampleSet] = SampleSet.from_samples_bqm
         if not bqm.num_variables:
-            return SampleSet.from_samples_bqm([], bqm)
+            return sample_set([], bqm)
         solver: Any = self.solver
         if num_reads is not None:
             if not hasattr(solver, "n_restarts"):
@@ -75,4 +77,4 @@ class DmmDimodSampler(dimod.Sampler):  # type: ignore[misc,name-defined]
         if bqm.vartype is dimod.SPIN:
             x = 2 * x - 1
         info = {"wall_time_s": solution.wall_time_s, "messages": solution.messages()}
-        return SampleSet.from_samples_bqm((np.ascontiguousarray(x), variables), bqm, info=info)
+        return sample_set((np.ascontiguousarray(x), variables), bqm, info=info)

@@ -10,6 +10,7 @@ from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.training import FINETUNING_SGD, LOSSES, ClassifierStep, OptimizerFactory, Schedule, score
+from memcomp_lightning.training.score import score_of
 from memcomp_lightning.types import Batch
 
 
@@ -54,16 +55,12 @@ class Classifier(StageModule):
 
     @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
-        """Follow the gradient of the mean loss; replicas add up and stay independent.
-
-        Returns:
-            ``loss`` (scalar) and ``score``.
-        """
+        """Follow the gradient of the mean loss; replicas add up and stay independent. Return the ``score``."""
         network = self.network if type(self).forward is Classifier.forward else self
         batch = batch._replace(v=plain(batch.v), label=plain(batch.label))
-        loss, logits = ClassifierStep(network, self.loss).loss(batch)
+        loss, losses, logits = ClassifierStep(network, self.loss).loss(batch)
         self.update(loss, closes_step=batch.closes_step)
-        return {"loss": loss.detach(), "score": score(logits, batch.label, self.loss)}
+        return {"loss": loss.detach(), "score": score_of(losses, logits, batch.label)}
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of held-out images."""

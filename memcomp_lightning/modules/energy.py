@@ -55,9 +55,6 @@ class EnergyPretraining(StageModule):
         centring: Settings of the centred gradient; None follows the plain one.
         seed: Seed of the random streams.
 
-    Raises:
-        SettingError: ``iterations`` out of range, or a model that the sampler cannot handle.
-
     Attributes:
         network: What is pretrained.
         energy_gaps: For each model begun, mean energy of the data less that of the negative phase, in its newest
@@ -154,11 +151,6 @@ class EnergyPretraining(StageModule):
         return (parameter for parameter in self.parameters() if parameter not in in_training)
 
     @property
-    def n_epochs(self) -> int:
-        """Value for the trainer's ``max_epochs``: all models."""
-        return self.iterations * len(self.phases)
-
-    @property
     def layer(self) -> int:
         """Index of the model in training, 0 being the first."""
         return len(self._begun_at) - 1 + self._next_is_due
@@ -203,10 +195,7 @@ class EnergyPretraining(StageModule):
             self._begun_at.append(self.current_epoch)
         if self.iteration == 0:
             self._state = StepState()
-            self.energy_gaps = [
-                *self.energy_gaps,
-                torch.zeros(self.model.replicas, dtype=torch.float32, device="cpu"),
-            ]
+            self.energy_gaps.append(torch.zeros(self.model.replicas, dtype=torch.float32, device="cpu"))
             for callback in self.trainer.early_stopping_callbacks:
                 callback.wait_count, callback.stopped_epoch = 0, 0
                 callback.best_score = torch.tensor(math.inf if callback.mode == "min" else -math.inf, device="cpu")
@@ -241,13 +230,7 @@ class EnergyPretraining(StageModule):
 
     @with_gradient()
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
-        """Follow the gradient of the contrast of both phases.
-
-        Returns:
-            ``loss`` (scalar), ``contrast`` ``(*replicas,)``, ``v`` (the model's visible states of the images),
-            ``positive`` and ``negative`` (:class:`Configurations`) and the samplers' ``info``: what the callbacks
-            look at.
-        """
+        """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
         with torch.no_grad():
             v = self.phase.visible_of(batch.v)
             positive, inferred = self.phase.positive(v, self.streams["positive_phase"])

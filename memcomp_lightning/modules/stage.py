@@ -62,8 +62,8 @@ class StageModule(pl.LightningModule):
 
     @property
     def n_epochs(self) -> int:
-        """Value for the trainer's ``max_epochs``."""
-        return self.iterations
+        """Value for the trainer's ``max_epochs``: the passes of all models."""
+        return self.iterations * self.n_models
 
     @property
     def iteration(self) -> int:
@@ -137,16 +137,12 @@ class StageModule(pl.LightningModule):
             optimizer = optimizers[optimizer_index] if isinstance(optimizers, list) else optimizers
             optimizer.step()
             optimizer.zero_grad()
-            if self.trainer.is_last_batch:
-                self._check_finite()
-
-    def _check_finite(self) -> None:
-        """Stop before the pass's checkpoint is written, so that the last good one stays."""
-        if (diverged := diverged_parameter(self)) is not None:
-            raise DivergedError(
-                f"{self.progress}: training diverged, {diverged}. Lower the learning rate "
-                f"({self.stage}.optimizer.lr) and start a new run."
-            )
+            # Before the pass's checkpoint is written, so that the last good one stays.
+            if self.trainer.is_last_batch and (diverged := diverged_parameter(self)) is not None:
+                raise DivergedError(
+                    f"{self.progress}: training diverged, {diverged}. Lower the learning rate "
+                    f"({self.stage}.optimizer.lr) and start a new run."
+                )
 
     def on_train_batch_end(self, *_: object) -> None:
         """Keep a wish to stop until the end of the pass."""
@@ -161,11 +157,7 @@ class StageModule(pl.LightningModule):
             self._stop_asked, self.trainer.should_stop = True, False
 
     def on_train_epoch_end(self) -> None:
-        """Hand on a wish to stop.
-
-        Raises:
-            NotTrainedError: The pass ended in the middle of an update.
-        """
+        """Hand on a wish to stop; raise a NotTrainedError if the pass ended in the middle of an update."""
         if self._mid_update and not tries(self.trainer):
             raise NotTrainedError(
                 "the pass ended in the middle of an update, whose step was not taken. Something "
@@ -207,11 +199,7 @@ class StageModule(pl.LightningModule):
         self._loaded = checkpoint["process_states"]
 
     def on_train_start(self) -> None:
-        """Take back streams and extra state, now that device and number of processes are settled.
-
-        Raises:
-            ValueError: The checkpoint was written by another number of processes.
-        """
+        """Take back streams and extra state, now that device and number of processes are settled."""
         self._started_at = time.perf_counter()
         check_schedules(self.schedules, self.trainer.optimizers)
         if self._loaded is None:

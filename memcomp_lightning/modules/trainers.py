@@ -52,10 +52,7 @@ _NEED_A_LOGGER = (callbacks.DeviceStatsMonitor, callbacks.LearningRateMonitor, c
 
 
 def precision_of(value: object) -> str:
-    """The precision that a value of ``trainer.precision`` means, one of :data:`PRECISIONS`.
-
-    Raises:
-        SettingError: It mixes dtypes, or does not exist.
+    """The precision that a value of ``trainer.precision`` means: one of :data:`PRECISIONS`, or a SettingError.
 
     >>> precision_of(64)
     '64-true'

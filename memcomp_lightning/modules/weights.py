@@ -68,11 +68,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> None:
-    """Raise unless a state dict is one of this module.
+    """Raise a CheckpointError unless a state dict is one of this module.
 
-    Raises:
-        CheckpointError: Naming the first tensor that differs in name, shape or dtype or is not finite, or units
-            that are coupled otherwise, and what to do.
+    It names the first tensor that differs in name, shape or dtype or is not finite, or units that are coupled
+    otherwise, and says what to do.
     """
     own = module.state_dict()
     models: dict[str, Any] = dict(module.named_modules())

@@ -9,15 +9,12 @@ from numpy.typing import NDArray
 def picture_grid(pictures: NDArray[np.floating], *, zoom: int = 6, gap: int = 1) -> NDArray[np.float32]:
     """Lay pictures out row by row, nearly square, each stretched to [0, 1] on its own.
 
-    A constant picture becomes mid-grey; gaps and unused places are black.
+    A constant picture becomes mid-grey; gaps and unused places are black. The result is one picture in [0, 1].
 
     Args:
         pictures: ``(n, height, width)``, any range.
         zoom: Screen pixels a picture pixel, >= 1.
         gap: Picture pixels between pictures, >= 0.
-
-    Returns:
-        ``(height, width)`` in [0, 1].
 
     >>> picture_grid(np.zeros((3, 2, 2)), zoom=1, gap=1).shape
     (5, 5)

@@ -15,19 +15,13 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
 def plot_histograms(
     edges: NDArray[np.floating], counts: Mapping[str, NDArray[np.floating]], *, xlabel: str = ""
 ) -> Figure:
-    """Shares of values by bin, a filled step curve for each name.
+    """Shares of values by bin, a filled step curve for each name; a figure that pyplot does not know.
 
     Args:
         edges: ``(n_bins + 1,)``, rising.
         counts: Counts or weights of each bin by name, ``(n_bins,)`` each, at most four names; each set is drawn
             as shares of its sum.
         xlabel: Name of the quantity.
-
-    Returns:
-        A figure of its own, which pyplot does not know.
-
-    Raises:
-        SettingError: There are no sets of counts, or too many.
     """
     allowed = f"1 to {len(_COLOURS)} sets of counts"
     require(1 <= len(counts) <= len(_COLOURS), "counts", sorted(counts), allowed)

@@ -30,21 +30,13 @@ def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -
         last: Number of restarts in the large panel, >= 1.
         title: Printed above.
 
-    Returns:
-        A figure of its own, which pyplot does not know.
-
     Raises:
         SettingError: The trajectory is of several problems, or holds no records.
     """
     require_count("last", last)
     shape = tuple(trajectory.time.shape)
-    require(
-        len(shape) == 2,
-        "trajectory's shape",
-        shape,
-        "(n_restarts, n_records), one problem",
-        "Take one: Trajectory(*(field[index] for field in trajectory)).",
-    )
+    remedy = "Take one: Trajectory(*(field[index] for field in trajectory))."
+    require(len(shape) == 2, "trajectory's shape", shape, "(n_restarts, n_records), one problem", remedy)
     time, weight, starts = _one_after_another(trajectory)
     require(time.size > 0, "trajectory", f"of shape {shape}", "at least one record of dwell > 0")
     best = np.minimum.accumulate(weight)
@@ -93,8 +85,8 @@ def _one_after_another(trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
 
 
 def _draw(axes: Axes, time: Floats, weight: Floats, best: Floats, *, linewidth: float) -> None:
-    dashed = {"color": _BEST, "linestyle": "--", "drawstyle": "steps-post"}
-    axes.plot(time, best, linewidth=1.3 * linewidth, label="best so far", **dashed)
+    (line,) = axes.plot(time, best, color=_BEST, linewidth=1.3 * linewidth, linestyle="--", label="best so far")
+    line.set_drawstyle("steps-post")
     axes.plot(time, weight, color=_PATH, linewidth=linewidth, label="machine")
 
 

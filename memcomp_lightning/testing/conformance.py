@@ -86,15 +86,11 @@ def check_sampler(
             state = sampler.init(rbm, n_data, generator=generator)
             kept = [tensor.clone() for tensor in tensors_of(state).values()]
             answers.append(sampler.sample(rbm, state, positive, generator=generator))
-            _check(
-                all(a.equal(b) for a, b in zip(kept, tensors_of(state).values(), strict=True)),
-                f"{name} changed the state it was given; return a new one",
-            )
+            unchanged = all(a.equal(b) for a, b in zip(kept, tensors_of(state).values(), strict=True))
+            _check(unchanged, f"{name} changed the state it was given; return a new one")
         _check(global_state.equal(torch.get_rng_state()), f"{name} drew from torch's global random stream")
-        _check(
-            all(a.equal(b) for a, b in zip(before, rbm.parameters(), strict=True)),
-            f"{name} changed the model",
-        )
+        unchanged = all(a.equal(b) for a, b in zip(before, rbm.parameters(), strict=True))
+        _check(unchanged, f"{name} changed the model")
         first, second = (answer.configurations for answer in answers)
         _check(first.v.equal(second.v) and first.h.equal(second.h), f"{name}: same stream, other answer")
         _check_declarations(sampler, rbm, v_data, first)
@@ -103,11 +99,8 @@ def check_sampler(
         _check(loss.shape == replicas, f"{name}: contrast has shape {tuple(loss.shape)}, not {replicas}")
         loss.sum().backward()
         for parameter_name, parameter in rbm.named_parameters():
-            gradient = parameter.grad
-            _check(
-                gradient is not None and bool(gradient.isfinite().all()),
-                f"{name}: no finite gradient for {parameter_name}",
-            )
+            finite = parameter.grad is not None and bool(parameter.grad.isfinite().all())
+            _check(finite, f"{name}: no finite gradient for {parameter_name}")
         for key, value in answers[0].info.items():
             _check(not value.requires_grad, f"{name}: info[{key!r}] carries a gradient")
             _check(tuple(value.shape) in ((), replicas), f"{name}: info[{key!r}] has shape {tuple(value.shape)}")
@@ -190,18 +183,15 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
         _check(bool(((solution.assignments == 0) | (solution.assignments == 1)).all()), f"{where}: not binary")
         _check(solution.best.equal(again.best), f"{where}: same stream, other answer")
         was_run = solution.energies.isfinite()
-        recomputed = qubo.energy(solution.assignments)
-        _check(
-            bool((solution.energies == recomputed)[was_run].all()),
-            f"{where}: energies are not those of the assignments",
-        )
+        same = (solution.energies == qubo.energy(solution.assignments))[was_run]
+        _check(bool(same.all()), f"{where}: energies are not those of the assignments")
         tolerance = 1e-12 * (1 + exact.abs())
         _check(bool((solution.best_energy >= exact - tolerance).all()), f"{where}: below the true minimum")
         if finds_optimum:
             tolerance = 1e-6 * exact.abs()
             _check(bool((solution.best_energy <= exact + tolerance).all()), f"{where}: minimum not found")
-        same = solution.status.shape == shape and solution.steps.shape == shape
-        _check(same, f"{where}: status or steps of another shape than energies")
+        fit = solution.status.shape == shape and solution.steps.shape == shape
+        _check(fit, f"{where}: status or steps of another shape than energies")
 
 
 def _check(condition: bool, message: str) -> None:

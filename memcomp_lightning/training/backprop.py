@@ -38,24 +38,22 @@ class ClassifierStep:
     def add_gradient(self, batch: Batch) -> None:
         """Add the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
         if self._closed_form is None:
-            self._by_autograd(batch)[0].backward()
+            self.loss(batch)[0].backward()
             return
         for parameter, gradient in self._closed_form(batch)[1]:
             parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
 
-    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return ``share * mean loss``, summed over the replicas, to be differentiated once, and the logits."""
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Return ``share * mean loss``, summed over the replicas, to be differentiated once, losses and logits."""
         if self._closed_form is None:
-            return self._by_autograd(batch)
+            logits = self._network(batch.v)
+            losses = self._loss(logits, batch.label)
+            return _total(losses, batch), losses.detach(), logits.detach()
         logits, found = self._closed_form(batch)
+        losses = self._loss(logits, batch.label)
         parameters, gradients = zip(*found, strict=True)
-        value = _total(self._loss(logits, batch.label), batch)
         apply: Callable[..., Tensor] = _WithGradient.apply
-        return apply(value, gradients, *parameters), logits
-
-    def _by_autograd(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        logits = self._network(batch.v)
-        return _total(self._loss(logits, batch.label), batch), logits.detach()
+        return apply(_total(losses, batch), gradients, *parameters), losses, logits
 
 
 def _total(losses: Tensor, batch: Batch) -> Tensor:

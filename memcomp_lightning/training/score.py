@@ -42,8 +42,12 @@ class Score(NamedTuple):
 
 def score(logits: Tensor, label: Tensor, loss: Loss = cross_entropy) -> Score:
     """Return the score of logits ``(*replicas, n, n_classes)`` against labels ``(*replicas, n)``."""
-    n_correct = (logits.argmax(-1) == label).sum(-1)
-    return Score(loss(logits, label).sum(-1), n_correct, label.shape[-1])
+    return score_of(loss(logits, label), logits, label)
+
+
+def score_of(losses: Tensor, logits: Tensor, label: Tensor) -> Score:
+    """Return the score of logits whose losses, ``(*replicas, n)``, are known already."""
+    return Score(losses.sum(-1), (logits.argmax(-1) == label).sum(-1), label.shape[-1])
 
 
 @torch.no_grad()

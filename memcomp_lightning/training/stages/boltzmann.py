@@ -16,19 +16,12 @@ class Boltzmann:
     Args:
         network: The machine; trained in place.
         positive: Supplies the hidden units given the data, and is logged with the sampler; None is the mean field.
-
-    Raises:
-        SettingError: The network is no Boltzmann machine.
     """
 
     def __init__(self, network: BoltzmannMachine, *, positive: PositivePhaseSampler | None = None) -> None:
-        require(
-            isinstance(network, BoltzmannMachine),
-            "pretrained network",
-            type(network).__name__,
-            "a Boltzmann machine",
-            "For a DBN use pretrain=greedy, centred or joint.",
-        )
+        kind, remedy = type(network).__name__, "For a DBN use pretrain=greedy, centred or joint."
+        fits = isinstance(network, BoltzmannMachine)
+        require(fits, "pretrained network", kind, "a Boltzmann machine", remedy)
         self.network = network
         positive_of = partial(sampled, positive or MeanField(), network)
         self.phases = [Phase(name="jointly", tag="", model=network, positive=positive_of)]

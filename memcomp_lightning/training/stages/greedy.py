@@ -17,9 +17,6 @@ class Greedy:
 
     Args:
         network: The DBN; trained in place.
-
-    Raises:
-        SettingError: The network is no DBN.
     """
 
     def __init__(self, network: DBN) -> None:

@@ -18,9 +18,6 @@ class Joint:
     Args:
         network: The DBN; its weights are where training starts, random ones or those of greedy pretraining.
         positive: Supplies the hidden units given the data; None is the mean field.
-
-    Raises:
-        SettingError: The network is no DBN.
     """
 
     def __init__(self, network: DBN, *, positive: PositivePhaseSampler | None = None) -> None:

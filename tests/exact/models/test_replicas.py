@@ -54,7 +54,8 @@ def test_gradient_is_that_of_the_mean_loss(loss, kind, replicas):
     step = ClassifierStep(quick, loss)
     assert step._closed_form is not None
     step.add_gradient(data)
-    value, logits = step.loss(data)
+    value, losses, logits = step.loss(data)
+    torch.testing.assert_close(losses, loss(slow(data.v), data.label))
     value.backward()  # chunks add up, by either way
     (2 * data.share * score(slow(data.v), data.label, loss).mean_loss.sum()).backward()
     torch.testing.assert_close(value, data.share * score(slow(data.v), data.label, loss).mean_loss.sum())
