@@ -9,6 +9,7 @@ from memcomp_lightning.callbacks.base import EveryIterations, tensorboards, writ
 from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
+from memcomp_lightning.training.stages.base import unchanged
 
 
 class Pictures(EveryIterations):
@@ -47,6 +48,5 @@ class Pictures(EveryIterations):
 
 def inputs_of(module: pl.LightningModule, v: Tensor) -> Tensor:
     """Inputs that visible states stand for."""
-    images_of = getattr(module, "images_of", None)
-    images: Tensor = v if images_of is None else images_of(v)
+    images: Tensor = getattr(module, "images_of", unchanged)(v)
     return images

@@ -43,6 +43,5 @@ def annealer_graph(kind: Kind, size: int, n_visible: int) -> Int[Tensor, "n_pair
     require(n_visible < n_units, "n_visible", n_visible, allowed, "Raise size, or take data with fewer inputs.")
     visible = torch.arange(n_visible) * n_units // n_visible
     hidden = torch.arange(n_units)[~torch.isin(torch.arange(n_units), visible)]
-    number = torch.empty(n_units, dtype=torch.long)
-    number[torch.cat((visible, hidden))] = torch.arange(n_units)
+    number = torch.cat((visible, hidden)).argsort()
     return from_pairs(n_units, number[pairs])

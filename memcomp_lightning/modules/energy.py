@@ -56,7 +56,6 @@ class EnergyPretraining(StageModule):
         seed: Seed of the random streams.
 
     Attributes:
-        network: What is pretrained.
         energy_gaps: For each model begun, mean energy of the data less that of the negative phase, in its newest
             update, ``(*replicas,)``: the contrast.
     """

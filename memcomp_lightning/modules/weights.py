@@ -101,9 +101,10 @@ def check_fits(module: nn.Module, state_dict: dict[str, Any], path: Path) -> Non
         if found.dtype != tensor.dtype and (
             not found.is_floating_point() or torch.promote_types(found.dtype, tensor.dtype) != tensor.dtype
         ):
+            held, own_dtype = (str(dtype).removeprefix("torch.") for dtype in (found.dtype, tensor.dtype))
             raise CheckpointError(
-                f"checkpoint {path}: {name} is {_dtype(found)}, which {_dtype(tensor)}, the dtype of this model, "
-                "cannot hold. Use the trainer.precision it was made with."
+                f"checkpoint {path}: {name} is {held}, which {own_dtype}, the dtype of this model, cannot hold. "
+                "Use the trainer.precision it was made with."
             )
         if not bool(found.isfinite().all()):
             raise CheckpointError(
@@ -119,10 +120,6 @@ def check_checkpoint(module: nn.Module, path: Path) -> None:
             f"checkpoint {path} is no checkpoint of a stage in training: delete it to train the stage again."
         )
     check_fits(module, content["state_dict"], path)
-
-
-def _dtype(tensor: Tensor) -> str:
-    return str(tensor.dtype).removeprefix("torch.")
 
 
 def load_weights(module: nn.Module, path: Path) -> None:

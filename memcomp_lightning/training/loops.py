@@ -174,17 +174,17 @@ class ClassifierTraining:
         self.optimizer = optimizer(network.parameters())
         self.passes_done = 0
 
+    @with_gradient()
     def run_pass(self, batches: Iterable[Batch]) -> None:
         """Update the network by each step of the batches, once; it is in evaluation mode afterwards."""
         self.network.train()
         begin_pass(self.schedules, self.optimizer, self.passes_done)
-        with with_gradient():
-            step = ClassifierStep(self.network, self.loss)
-            for batch in batches:
-                step.add_gradient(batch)
-                if batch.closes_step:
-                    self.optimizer.step()
-                    self.optimizer.zero_grad()
+        step = ClassifierStep(self.network, self.loss)
+        for batch in batches:
+            step.add_gradient(batch)
+            if batch.closes_step:
+                self.optimizer.step()
+                self.optimizer.zero_grad()
         self.network.eval()
         self.passes_done += 1
 
