@@ -163,8 +163,9 @@ def _laid_out(samples: Samples) -> tuple[Array, Array | None]:
     if (weight == np.round(weight)).all() and weight.mean() <= MOST_REPEATS:
         return order.repeat(weight.astype(np.int64)), None
     weight = weight / weight.mean()
-    copies = np.ceil(weight - 1e-6).astype(np.int64)
-    return order.repeat(copies), (weight / copies).repeat(copies)
+    copies = np.ceil(weight - 1e-6)  # in the precision of the weights, which the quotient keeps
+    repeats = copies.astype(np.int64)
+    return order.repeat(repeats), (weight / copies).repeat(repeats)
 
 
 def tensor_of(X: Matrix) -> Tensor | SparseRows:

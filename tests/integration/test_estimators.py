@@ -354,6 +354,13 @@ def test_fractional_weights_keep_steps_even():
     assert total == pytest.approx(30.0)
 
 
+def test_fractional_weights_keep_the_precision_of_the_data():
+    X, _ = binary(30)
+    weight = np.random.default_rng(1).uniform(0.1, 9.0, 30)
+    made = rbm(batch_size=10, n_iter=1).fit(X.astype(np.float32), sample_weight=weight)
+    assert made.components_.dtype == np.float32
+
+
 @pytest.mark.parametrize("make", BOTH)
 @pytest.mark.parametrize(
     ("weight", "message"),
