@@ -56,10 +56,8 @@ class FreeEnergyGap(pl.Callback):
             return
         heldout = sum(total for total, _ in self._heldout) / sum(n for _, n in self._heldout)
         train = _free_energy(pl_module, images).mean(-1)
-        log_scalars(
-            pl_module,
-            {"free_energy_train": train, "free_energy_heldout": heldout, "free_energy_gap": heldout - train},
-        )
+        values = {"free_energy_train": train, "free_energy_heldout": heldout, "free_energy_gap": heldout - train}
+        log_scalars(pl_module, values)
 
 
 @torch.no_grad()

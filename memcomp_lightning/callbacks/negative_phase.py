@@ -18,12 +18,10 @@ class NegativePhaseEnergies(EveryIterations):
         model = model_of(pl_module)
         step = required(outputs, self, "positive", "negative", "contrast")
         positive, negative = step["positive"], step["negative"]
-        log_scalars(
-            pl_module,
-            {
-                "energy_data": model.energy(positive.v, positive.h).mean(-1),
-                "energy_model": model.mean_energy(negative),
-                "energy_model_lowest": model.energy(negative.v, negative.h).min(-1).values,
-                "contrast": step["contrast"],
-            },
-        )
+        values = {
+            "energy_data": model.energy(positive.v, positive.h).mean(-1),
+            "energy_model": model.mean_energy(negative),
+            "energy_model_lowest": model.energy(negative.v, negative.h).min(-1).values,
+            "contrast": step["contrast"],
+        }
+        log_scalars(pl_module, values)

@@ -46,11 +46,7 @@ def cache_folder() -> Path:
 
 
 def raw_folder(data_dir: str | None) -> Path:
-    """Return the folder of the files, ``<root>/MNIST/raw``.
-
-    The root is ``data_dir``, else the environment variable ``MEMCOMP_DATA_DIR``, else
-    :func:`cache_folder`.
-    """
+    """Return ``MNIST/raw`` in ``data_dir``, else in the folder of ``MEMCOMP_DATA_DIR``, else in the cache."""
     root = data_dir or os.environ.get("MEMCOMP_DATA_DIR")
     return (Path(root).expanduser().absolute() if root else cache_folder()) / "MNIST" / "raw"
 

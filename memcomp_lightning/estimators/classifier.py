@@ -241,12 +241,10 @@ class MemcompDBNClassifier(ClassifierMixin, MemcompEstimator):  # type: ignore[m
         )
         for _ in passes:
             pass
-        output_init = partial(drawn, std=self.weight_std, dtype=dbn[0].weight.dtype)
+        init = partial(drawn, std=self.weight_std, dtype=dbn[0].weight.dtype)
         generator = rng.stream(seed, "output weights")
-        n_classes = len(self.classes_)
-        self.network_ = DBNClassifier(
-            dbn, n_classes=n_classes, output_init=output_init, generator=generator
-        ).network
+        module = DBNClassifier(dbn, n_classes=len(self.classes_), output_init=init, generator=generator)
+        self.network_ = module.network
         self._seed, self.n_iter_ = seed, 0
         self._training = ClassifierTraining(self.network_, optimizer=self._optimizer())
 

@@ -12,8 +12,7 @@ from memcomp_lightning.errors import require, require_count
 class ShiftingBars:
     """The cyclic shifts of a bar of ones, one class a shift.
 
-    Training and test set hold the same patterns: the task is to learn the distribution, which is uniform
-    over the ``n_pixels`` shifts.
+    Training and test set hold the same patterns: the task is to learn their distribution, which is uniform.
 
     Args:
         n_pixels: Length of the pattern, >= 2.
