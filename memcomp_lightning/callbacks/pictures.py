@@ -1,15 +1,18 @@
 """A grid of pictures of the inputs in TensorBoard: base of the callbacks that draw some."""
 
 from abc import abstractmethod
+from typing import TYPE_CHECKING
 
 import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import EveryIterations, tensorboards, write_picture
-from memcomp_lightning.data import PixelLayout
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.training.stages.base import unchanged
+
+if TYPE_CHECKING:
+    from memcomp_lightning.data import PixelLayout
 
 
 class Pictures(EveryIterations):
