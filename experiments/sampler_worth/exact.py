@@ -48,7 +48,7 @@ def main() -> None:
             f"{float((exact - by_ais).abs().max()):.3f}",
             f"{time.perf_counter() - begin:.0f}",
         ]
-        print(f"| {worth.plan['methods'][method]['label']} | {' | '.join(cells)} |", flush=True)
+        print(f"| {worth.plan.methods[method].label} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

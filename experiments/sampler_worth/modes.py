@@ -43,7 +43,7 @@ def main() -> None:
             found = solver.minimise(problem, generator=rng.stream(0, "solver")).best_energy
             gap = (found - mode).clamp(min=0)
             cells.append(f"{float(gap.median()):.2f}, {float(gap.max()):.2f}")
-        print(f"| {worth.plan['methods'][method]['label']} | {' | '.join(cells)} |", flush=True)
+        print(f"| {worth.plan.methods[method].label} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":
