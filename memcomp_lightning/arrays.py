@@ -38,12 +38,19 @@ def alike(x: AnyArray, like: AnyArray) -> Array:
         return as_array(x)
     if isinstance(like, np.ndarray | np.generic):
         return as_array(to_numpy(x))
+    if isinstance(x, np.ndarray) and not x.flags.writeable:
+        x = x.copy()  # it would share its memory with the tensor
     return namespace(like).asarray(x, device=like.device)
 
 
 def to_numpy(x: AnyArray) -> NDArray[Any]:
     """``x`` as a numpy array, which shares its memory where it can."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
+
+
+def is_floating(x: Array) -> bool:
+    """Whether ``x`` holds real numbers, of any precision."""
+    return x.dtype.kind == "f" if isinstance(x, np.ndarray | np.generic) else x.is_floating_point()
 
 
 def cast(x: Array, dtype: Any) -> Array:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from memcomp_lightning.arrays import Array, alike, as_array, cast, namespace
+from memcomp_lightning.arrays import Array, alike, as_array, cast, is_floating, namespace
 
 if TYPE_CHECKING:
     import torch
@@ -69,18 +69,24 @@ def restore(generators: "dict[str, torch.Generator]", states: "dict[str, Tensor]
 
 
 def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None = None) -> Array:
-    """Draw from U[0, 1) in float32 or the dtype of ``like``, as an array of its library on its device.
+    """Draw from U[0, 1), as an array of the library of ``like`` on its device.
+
+    It is in the dtype of ``like``, or in float32 where that holds whole numbers.
 
     Without ``like`` it is an array of the generator's library.
     """
     if isinstance(generator, np.random.Generator):
-        dtype = np.float64 if like is not None and like.dtype == namespace(like).float64 else np.float32
-        draw = as_array(generator.random(tuple(shape), dtype=dtype))
-        return draw if like is None else cast(alike(draw, like), like.dtype)
+        double = like is not None and like.dtype == namespace(like).float64
+        draw = as_array(generator.random(tuple(shape), dtype=np.float64 if double else np.float32))
+        if like is None:
+            return draw
+        return cast(alike(draw, like), like.dtype) if is_floating(like) else alike(draw, like)
     import torch
 
     of_numpy = isinstance(like, np.ndarray)
-    wanted = torch.float32 if like is None else getattr(torch, str(like.dtype)) if of_numpy else like.dtype
+    wanted = torch.float32
+    if like is not None and is_floating(like):
+        wanted = getattr(torch, str(like.dtype)) if of_numpy else like.dtype
     draw = torch.empty(tuple(shape), device=generator.device, dtype=wanted).uniform_(generator=generator)
     return draw if like is None else alike(draw, like) if of_numpy else draw.to(like.device)
 

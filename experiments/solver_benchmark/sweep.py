@@ -85,7 +85,7 @@ class Store:
 def version(solver: str) -> str:
     """Changes when the numbers may: of the DMM its source, of an opponent the packages' versions."""
     if solver.startswith("DMM"):
-        folder = Path(memcomp_lightning.__file__).parent / "dmm"
+        folder = Path(memcomp_lightning.__file__).parent / "solvers/dmm"
         source = b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))
         return hashlib.sha256(source).hexdigest()[:12]
     return " ".join(importlib.metadata.version(package) for package in PACKAGES[:3])

@@ -178,7 +178,8 @@ class EdgeList:
 
     def alike(self, like: AnyArray) -> "EdgeList":
         """The same pairs in the library and on the device of ``like``."""
-        return EdgeList(self.n, alike(self.pairs, like))
+        pairs = alike(self.pairs, like)
+        return self if pairs is self.pairs else EdgeList(self.n, pairs)
 
     def edges(self) -> Array:
         """The pairs."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, cast, double, namespace
+from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, cast, double, is_floating, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import EdgeList, Graph
 
@@ -28,6 +28,7 @@ class Qubo:
     offset: Array
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "graph", self.graph.alike(self.linear))
         edge_shape, n = self.graph.edge_shape, self.graph.n
         axes = len(edge_shape)
         require(
@@ -61,6 +62,10 @@ class Qubo:
     def double(self) -> "Qubo":
         """The same problem in float64."""
         return Qubo(self.graph, double(self.coupling), double(self.linear), double(self.offset))
+
+    def floating(self) -> "Qubo":
+        """Itself, or in float64 where it is of whole numbers: what searches by random steps work with."""
+        return self if is_floating(self.linear) else self.double()
 
     def alike(self, like: AnyArray) -> "Qubo":
         """The same problem in the library and on the device of ``like``: a tensor, as to solve it on a GPU."""

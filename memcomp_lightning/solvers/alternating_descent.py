@@ -34,7 +34,8 @@ class AlternatingDescent:
 
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return one local minimum a start."""
-        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        begin, qubo = time.perf_counter(), qubo.floating()
+        xp = namespace(qubo.linear)
         x = random_states(qubo, self.n_restarts, generator)
         moving = xp.ones(x.shape[:-1], dtype=xp.bool, device=x.device)
         steps = xp.zeros(x.shape[:-1], dtype=xp.int64, device=x.device)

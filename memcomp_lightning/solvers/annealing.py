@@ -44,9 +44,11 @@ class GibbsAnnealing:
         allowed = f"a number >= beta_first = {self.beta_first}"
         require(self.beta_last >= self.beta_first, "beta_last", self.beta_last, allowed)
 
+    @np.errstate(under="ignore")
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the end of each restart."""
-        begin, xp = time.perf_counter(), namespace(qubo.linear)
+        begin, qubo = time.perf_counter(), qubo.floating()
+        xp = namespace(qubo.linear)
         x = random_states(qubo, self.n_restarts, generator)
         blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
         growth = self.beta_last / self.beta_first

@@ -51,6 +51,7 @@ class BranchAndBound:
         from memcomp_lightning.solvers.kernels.branch_and_bound import search
 
         begin = time.perf_counter() - compiling.seconds_spent()
+        qubo = qubo.floating()
         graph = qubo.graph
         if not isinstance(graph, Bipartite):
             raise SettingError(

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import numpy as np
+
 from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, alike, cast, double, namespace
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
@@ -132,6 +134,7 @@ class DmmSolver:
             obstacle = self._obstacle("cpu")
             require(obstacle is None, "kernel", self.kernel, "'auto' or 'reference' here", obstacle or "")
 
+    @np.errstate(under="ignore")
     def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: "Generator") -> QuboSolution:
         """Return the best assignment of each restart.
 
@@ -140,7 +143,9 @@ class DmmSolver:
             generator: For the initial voltages and the noise, of numpy or torch.
         """
         begin = time.perf_counter() - compiling.seconds_spent()
-        flat = _flatten(_without_zeros(problem))
+        if isinstance(problem, Qubo):
+            problem = _without_zeros(problem.floating())
+        flat = _flatten(problem)
         n_problems, device, xp = flat.offset.shape[0], flat.offset.device, namespace(flat.offset)
         n_steps = self.max_steps or default_steps(flat)
         group_size = self.patience or self.n_restarts
@@ -313,9 +318,9 @@ def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Array], Array]) -> Qu
     )
 
 
-def _without_zeros(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:
+def _without_zeros(problem: Qubo) -> Qubo:
     """Turn two layers with few non-zero couplings into a list of pairs, which is faster to integrate."""
-    if not (isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite)):
+    if not isinstance(problem.graph, Bipartite):
         return problem
     flat = problem.coupling.reshape(*problem.problems, -1)
     used = flat != 0

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.problems import Bipartite, Qubo, WeightedMaxSat, from_model
+from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_model
 from memcomp_lightning.solvers import AlternatingDescent, BranchAndBound, BruteForce, GibbsAnnealing, Status
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, WarmRestart
 from memcomp_lightning.testing.conformance import small_rbm
@@ -325,3 +326,27 @@ def test_problems_in_numpy_are_solved_without_torch():
     lowest, *others = map(float, done.stdout.split())
     assert others == pytest.approx([lowest] * 3)
     assert lowest < 0
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+@pytest.mark.parametrize(
+    "solver",
+    [AlternatingDescent(), GibbsAnnealing(), DmmSolver(), DmmSolver(kernel="reference")],
+    ids=["descent", "annealing", "compiled", "reference"],
+)
+def test_whole_numbers_are_searched_as_real_ones(solver, library):
+    numbers = np.random.default_rng(0).integers(-9, 10, (40, 40))
+    whole = Qubo.from_matrix(numbers if library == "numpy" else torch.from_numpy(numbers))
+    found = solver.minimise(whole, generator=rng.numpy_stream(0, "solver"))
+    as_real = solver.minimise(whole.double(), generator=rng.numpy_stream(0, "solver"))
+    assert (found.assignments == as_real.assignments).all()
+    assert (found.energies == as_real.energies).all()
+    assert len(np.unique(to_numpy(found.assignments), axis=0)) > 1
+
+
+def test_pairs_and_numbers_of_two_libraries_become_one():
+    pairs = Bipartite(2, 2).edges()
+    problem = Qubo(EdgeList(4, pairs), torch.ones(4), torch.ones(4), torch.zeros(()))
+    assert problem.energy(torch.ones(1, 4)).tolist() == [8.0]
+    read_only = np.broadcast_to(np.ones(()), (4,))
+    assert Qubo(Bipartite(2, 2), np.ones((2, 2)), read_only, np.zeros(())).alike(torch.zeros(())).linear.sum() == 4
