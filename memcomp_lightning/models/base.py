@@ -200,13 +200,12 @@ def as_two_layers(model: EnergyModel) -> TwoLayers:
         SettingError: The units do not fall into two classes.
     """
     layers = model.two_layers()
-    if layers is None:
-        require(
-            False,
-            "number of classes of units",
-            len(model.classes),
-            "2, with couplings only between them, as in an RBM, a DBM or a grid",
-            "For other machines use log_partition_function, up to 32 units outside the largest class.",
-        )
-        raise AssertionError
+    require(
+        layers is not None,
+        "number of classes of units",
+        len(model.classes),
+        "2, with couplings only between them, as in an RBM, a DBM or a grid",
+        "For other machines use log_partition_function, up to 32 units outside the largest class.",
+    )
+    assert layers is not None
     return layers

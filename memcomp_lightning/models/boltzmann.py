@@ -9,16 +9,15 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 from torch.nn.functional import softplus
 
-from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
 from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.machine import Machine
 from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
-from memcomp_lightning.objective import shares
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
 
@@ -39,7 +38,7 @@ class _Layout(NamedTuple):
 _INDICES = ("units", "neighbours", "edge", "slot")
 
 
-class BoltzmannMachine(nn.Module):
+class BoltzmannMachine(Machine):
     r"""A model of binary data v with hidden units h: x = (v, h) in {0, 1}, with couplings between any pairs.
 
     .. math:: E(x) = -\sum_{(i, j)} w_{ij} x_i x_j - \sum_i a_i x_i, \qquad a = (b, c)
@@ -153,26 +152,6 @@ class BoltzmannMachine(nn.Module):
         return matrix[..., self.pairs[:, 0], self.pairs[:, 1]]
 
     @property
-    def n_visible(self) -> int:
-        """Number of visible units."""
-        return self.b.shape[-1]
-
-    @property
-    def n_hidden(self) -> int:
-        """Number of hidden units."""
-        return self.c.shape[-1]
-
-    @property
-    def n_units(self) -> int:
-        """Number of all units."""
-        return self.n_visible + self.n_hidden
-
-    @property
-    def replicas(self) -> tuple[int, ...]:
-        """Leading axes of independent machines."""
-        return tuple(self.coupling.shape[:-1])
-
-    @property
     def bias(self) -> Tensor:
         """Biases of all units, a = (b, c), ``(*replicas, n_units)``."""
         return torch.cat((self.b, self.c), dim=-1)
@@ -254,56 +233,33 @@ class BoltzmannMachine(nn.Module):
         )
         return -0.5 * coupled - (x * self.bias.unsqueeze(-2)).sum(-1)
 
-    def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
-        """Mean of E over configurations, by their weights."""
-        return self.total_energy(configurations.v, configurations.h, shares(configurations))
+    def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        x = torch.cat((v, h), dim=-1)
+        return self._sums(x, x * weight.unsqueeze(-1))
 
-    @in_own_dtypes
-    def total_energy(
-        self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
-    ) -> Float[Tensor, "*replicas"]:
-        """Weighted sum of E over configurations, constants to autograd; the weights may have any sign."""
-        with torch.no_grad():
-            x = torch.cat((v, h), dim=-1)
-            moment, mean = self._moments(x, x * weight.unsqueeze(-1))
-        total: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
-        return total
+    def _centred_moments(
+        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        offset = torch.cat((visible_offset, hidden_offset), dim=-1)
+        x = torch.cat((v, h), dim=-1) - offset.unsqueeze(-2)
+        of_pairs, of_units = self._sums(x, x * weight.unsqueeze(-1))
+        first, second = self.pairs[:, 0], self.pairs[:, 1]
+        of_units = of_units.index_add(-1, first, of_pairs * offset[..., second], alpha=-1)
+        return of_pairs, of_units.index_add(-1, second, of_pairs * offset[..., first], alpha=-1)
 
-    @in_own_dtypes
-    def centred_total_energy(
-        self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
-        visible_offset: Float[Tensor, "*replicas n_visible"],
-        hidden_offset: Float[Tensor, "*replicas n_hidden"],
-    ) -> Float[Tensor, "*replicas"]:
-        """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
-
-        (Montavon & Mueller 2012.)
-        """
-        with torch.no_grad():
-            value = self.total_energy(v, h, weight)
-            offset = torch.cat((visible_offset, hidden_offset), dim=-1)
-            x = torch.cat((v, h), dim=-1) - offset.unsqueeze(-2)
-            moment, mean = self._moments(x, x * weight.unsqueeze(-1))
-            first, second = self.pairs[:, 0], self.pairs[:, 1]
-            mean = mean.index_add(-1, first, moment * offset[..., second], alpha=-1)
-            mean = mean.index_add(-1, second, moment * offset[..., first], alpha=-1)
-        surrogate: Tensor = -(vecdot(self.coupling, moment) + vecdot(self.bias, mean))
-        return value + (surrogate - surrogate.detach())
-
-    def _moments(self, x: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
+    def _sums(self, x: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
         """Sums over configurations of the product of each pair and of each unit."""
-        moment = torch.empty_like(self.coupling)
+        of_pairs = torch.empty_like(self.coupling)
         for units, neighbours, edge, slot, n in self._layouts():
             if n:
                 products = (x[..., units].mT @ weighted[..., neighbours]).flatten(-2)
-                moment.index_copy_(-1, edge[:n], products[..., slot[:n]])
-        return moment, weighted.sum(-2)
+                of_pairs.index_copy_(-1, edge[:n], products[..., slot[:n]])
+        return of_pairs, weighted.sum(-2)
+
+    def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
+        of_pairs, of_units = moments
+        total: Tensor = -(vecdot(self.coupling, of_pairs) + vecdot(self.bias, of_units))
+        return total
 
     def hidden_mean(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
         """E[h | v]: exact if no two hidden units are coupled, otherwise by :func:`mean_field`, its defaults."""

@@ -6,7 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.models.base import Block, EnergyModel, Readout
+from memcomp_lightning.models.base import EnergyModel, Readout
 from memcomp_lightning.types import Configurations
 
 if TYPE_CHECKING:
@@ -20,8 +20,12 @@ def sweep(model: "RBM", v: Tensor, *, beta: float | Tensor = 1.0, generator: Gen
     Leaves the distribution ``exp(-beta E) / Z(beta)`` invariant. Values of ``v`` between 0 and 1 are taken as
     they are in the first half of the sweep.
     """
+    return _swept(model, v, beta, generator)[0]
+
+
+def _swept(model: "RBM", v: Tensor, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
     h = rng.bernoulli(model.hidden_mean(v, beta=beta), generator=generator)
-    return rng.bernoulli(model.visible_mean(h, beta=beta), generator=generator)
+    return rng.bernoulli(model.visible_mean(h, beta=beta), generator=generator), h
 
 
 def random_states(model: EnergyModel, n: int, n_units: int, *, generator: Generator) -> Tensor:
@@ -31,11 +35,7 @@ def random_states(model: EnergyModel, n: int, n_units: int, *, generator: Genera
 
 
 class TwoLayerChains:
-    """Gibbs chains of an RBM; a state is its visible units, from which each sweep draws the hidden ones anew.
-
-    Args:
-        model: The model.
-    """
+    """Gibbs chains of an RBM; a state is its visible units, from which each sweep draws the hidden ones anew."""
 
     free_readout = True
 
@@ -52,8 +52,7 @@ class TwoLayerChains:
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         """Draw h given v, then v given h; the energy of both."""
-        h = rng.bernoulli(self._model.hidden_mean(x, beta=beta), generator=generator)
-        v = rng.bernoulli(self._model.visible_mean(h, beta=beta), generator=generator)
+        v, h = _swept(self._model, x, beta, generator)
         return v, self._model.energy(v, h)
 
     def read(self, x: Tensor) -> Configurations:
@@ -78,21 +77,17 @@ class TwoLayerChains:
 
 
 class ClassChains:
-    """Chains of all units, class by class.
-
-    Args:
-        model: A model of any connectivity.
-    """
+    """Chains of all units of a model of any connectivity, class by class."""
 
     free_readout = False
 
     def __init__(self, model: EnergyModel) -> None:
         self._model = model
-        self._blocks: list[Block] = list(model.blocks())
+        self._blocks = model.blocks()
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw all units."""
-        return random_states(self._model, n, self._model.n_visible + self._model.n_hidden, generator=generator)
+        return random_states(self._model, n, self._model.n_units, generator=generator)
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw each class given all others."""

@@ -11,7 +11,7 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.connectivity import layered
 from memcomp_lightning.models.dbn import DBN
-from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.init import Initialiser
 
 
 class DBM(BoltzmannMachine):
@@ -65,9 +65,8 @@ class DBM(BoltzmannMachine):
         self, n_units: int, replicas: tuple[int, ...], weight_init: Initialiser, generator: Generator
     ) -> Tensor:
         """Initial couplings, layer by layer."""
-        init = weight_init or Gaussian(std=0.01)
-        drawn = [init((*replicas, n_out, n_in), generator=generator) for n_in, n_out in pairwise(self.sizes)]
-        return _flat(drawn)
+        shapes = [(*replicas, n_out, n_in) for n_in, n_out in pairwise(self.sizes)]
+        return _flat([weight_init(shape, generator=generator) for shape in shapes])
 
     def other_pairs(self, pairs: Tensor | None) -> str:
         """As in any machine; files without pairs are taken to be of the same layers."""

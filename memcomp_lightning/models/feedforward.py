@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -72,11 +72,11 @@ class BatchNorm(nn.Module):
         require_count("n_features", n_features)
         self.momentum = momentum
         self.eps = eps
-        plain: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
-        self.weight = nn.Parameter(torch.ones(*replicas, n_features, **plain))
-        self.bias = nn.Parameter(torch.zeros(*replicas, n_features, **plain))
-        self.register_buffer("running_mean", torch.zeros(*replicas, n_features, **plain))
-        self.register_buffer("running_var", torch.ones(*replicas, n_features, **plain))
+        ones = torch.ones(*replicas, n_features, dtype=torch.float32, device="cpu")
+        self.weight = nn.Parameter(ones)
+        self.bias = nn.Parameter(torch.zeros_like(ones))
+        self.register_buffer("running_mean", torch.zeros_like(ones))
+        self.register_buffer("running_var", ones.clone())
 
     def forward(self, x: Float[Tensor, "*replicas n n_features"]) -> Float[Tensor, "*replicas n n_features"]:
         """Normalise over the images of each replica.
@@ -126,14 +126,12 @@ class BatchNormReluNetwork(nn.Module):
         require_count("number of hidden layers", len(hidden_sizes))
         require_count("n_classes", n_classes, minimum=2)
         generator = stream(0, "weights") if generator is None else generator
+        linear = partial(Linear, replicas=replicas, weight_init=weight_init, generator=generator)
         sizes = [n_visible, *hidden_sizes]
         layers: list[nn.Module] = []
         for n_in, n_out in itertools.pairwise(sizes):
-            linear = Linear(n_in, n_out, replicas=replicas, weight_init=weight_init, generator=generator)
-            layers += [linear, BatchNorm(n_out, replicas=replicas), nn.ReLU()]
-        layers.append(
-            Linear(sizes[-1], n_classes, replicas=replicas, weight_init=weight_init, generator=generator)
-        )
+            layers += [linear(n_in, n_out), BatchNorm(n_out, replicas=replicas), nn.ReLU()]
+        layers.append(linear(sizes[-1], n_classes))
         self.layers = nn.Sequential(*layers)
 
     def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_classes"]:

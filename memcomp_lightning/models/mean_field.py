@@ -54,7 +54,7 @@ def mean_field(
     n_free = model.n_hidden if clamped == "visible" else n_visible
     unknown = given.new_full((*given.shape[:-1], n_free), 0.5)
     x = torch.cat((given, unknown) if clamped == "visible" else (unknown, given), dim=-1)
-    blocks = hidden_blocks(model) if clamped == "visible" else visible_blocks(model)
+    blocks = _free_blocks(model, clamped)
     coupled = any(bool(_among(block.neighbours, n_visible, clamped).any()) for block in blocks)
     if not coupled:
         for block in blocks:
@@ -88,12 +88,7 @@ def free_energy_of_means(
 
 def hidden_blocks(model: EnergyModel) -> list[Block]:
     """The hidden units of each class, without the classes that have none."""
-    return _part(model, "visible")
-
-
-def visible_blocks(model: EnergyModel) -> list[Block]:
-    """The visible units of each class, without the classes that have none."""
-    return _part(model, "hidden")
+    return _free_blocks(model, "visible")
 
 
 def _among(units: Tensor, n_visible: int, clamped: str) -> Tensor:
@@ -101,7 +96,8 @@ def _among(units: Tensor, n_visible: int, clamped: str) -> Tensor:
     return units >= n_visible if clamped == "visible" else units < n_visible
 
 
-def _part(model: EnergyModel, clamped: str) -> list[Block]:
+def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
+    """The free units of each class, without the classes that have none."""
     found = []
     for block in model.blocks():
         keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()

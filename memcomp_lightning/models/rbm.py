@@ -1,24 +1,25 @@
 """The Bernoulli restricted Boltzmann machine."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
-from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Gaussian, Initialiser
-from memcomp_lightning.objective import shares
+from memcomp_lightning.models.machine import Machine
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
 
 
-class RBM(nn.Module):
+class RBM(Machine):
     r"""A model of binary data: visible units hold it, hidden units explain it, couplings join the two layers only.
 
     .. math:: E(v, h) = -\sum_{ij} w_{ij} h_i v_j - \sum_j b_j v_j - \sum_i c_i h_i
@@ -63,26 +64,6 @@ class RBM(nn.Module):
         self.b = nn.Parameter(weight.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(weight.new_zeros(*replicas, n_hidden))
 
-    @property
-    def n_visible(self) -> int:
-        """Number of visible units."""
-        return self.weight.shape[-1]
-
-    @property
-    def n_hidden(self) -> int:
-        """Number of hidden units."""
-        return self.weight.shape[-2]
-
-    @property
-    def n_units(self) -> int:
-        """Number of all units."""
-        return self.n_visible + self.n_hidden
-
-    @property
-    def replicas(self) -> tuple[int, ...]:
-        """Leading axes of independent machines."""
-        return tuple(self.weight.shape[:-2])
-
     def energy(
         self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
     ) -> Float[Tensor, "*replicas n"]:
@@ -90,51 +71,25 @@ class RBM(nn.Module):
         hidden_part = (self.hidden_field(v) * h).sum(-1)
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
 
-    def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
-        """Mean of E over configurations, by their weights."""
-        return self.total_energy(configurations.v, configurations.h, shares(configurations))
+    def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        weighted_v = v * weight.unsqueeze(-1)
+        return h.mT @ weighted_v, weighted_v.sum(-2), (h * weight.unsqueeze(-1)).sum(-2)
 
-    @in_own_dtypes
-    def total_energy(
-        self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
-    ) -> Float[Tensor, "*replicas"]:
-        """Weighted sum of E over configurations; the weights may have any sign.
+    def _centred_moments(
+        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        centred_v = v - visible_offset.unsqueeze(-2)
+        weighted_h = (h - hidden_offset.unsqueeze(-2)) * weight.unsqueeze(-1)
+        of_weight = weighted_h.mT @ centred_v
+        of_b = (centred_v * weight.unsqueeze(-1)).sum(-2) - (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
+        of_c = weighted_h.sum(-2) - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
+        return of_weight, of_b, of_c
 
-        E is linear in the parameters, so the sum needs only the moments sum h v, sum v and sum h: one matrix
-        product here, and none in its backward pass. The configurations are constants to autograd.
-        """
-        with torch.no_grad():
-            weighted_v = v * weight.unsqueeze(-1)
-            moment = h.mT @ weighted_v
-            sum_v, sum_h = weighted_v.sum(-2), (h * weight.unsqueeze(-1)).sum(-2)
-        coupled: Tensor = vecdot(self.weight.flatten(-2), moment.flatten(-2))
-        biases: Tensor = vecdot(self.b, sum_v) + vecdot(self.c, sum_h)
-        return -(coupled + biases)
-
-    @in_own_dtypes
-    def centred_total_energy(
-        self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
-        visible_offset: Float[Tensor, "*replicas n_visible"],
-        hidden_offset: Float[Tensor, "*replicas n_hidden"],
-    ) -> Float[Tensor, "*replicas"]:
-        """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of the centred RBM."""
-        with torch.no_grad():
-            value = self.total_energy(v, h, weight)
-            centred_v = v - visible_offset.unsqueeze(-2)
-            weighted_h = (h - hidden_offset.unsqueeze(-2)) * weight.unsqueeze(-1)
-            of_weight = weighted_h.mT @ centred_v
-            of_b = (centred_v * weight.unsqueeze(-1)).sum(-2)
-            of_b -= (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
-            of_c = weighted_h.sum(-2) - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
+    def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
+        of_weight, of_b, of_c = moments
         coupled: Tensor = vecdot(self.weight.flatten(-2), of_weight.flatten(-2))
-        surrogate: Tensor = -(coupled + vecdot(self.b, of_b) + vecdot(self.c, of_c))
-        return value + (surrogate - surrogate.detach())
+        biases: Tensor = vecdot(self.b, of_b) + vecdot(self.c, of_c)
+        return -(coupled + biases)
 
     def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
         r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
