@@ -21,6 +21,9 @@ from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor
 
+base_of = mean_log_odds
+"""Visible bias of the independent units that have the data's means, a base for AIS."""
+
 
 class AisEstimate(NamedTuple):
     """An estimate of log Z with what it takes to judge it; ``str`` gives a line a replica.
@@ -49,7 +52,31 @@ class AisEstimate(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Ais:
+class _Annealing:
+    """Settings of both directions."""
+
+    n_betas: int = 1000
+    betas: Schedule | None = None
+    k: int = 1
+
+    def __post_init__(self) -> None:
+        require_count("n_betas", self.n_betas)
+        require_count("k", self.k)
+        if self.betas is None:
+            return
+        betas = tuple(float(beta) for beta in self.betas)
+        rises = betas[:1] == (0.0,) and betas[-1] == 1.0 and all(low < high for low, high in pairwise(betas))
+        require(rises, "betas", self.betas, "numbers that increase from 0 to 1, both among them")
+        object.__setattr__(self, "betas", betas)
+
+    def _schedule(self) -> list[float]:
+        if self.betas is None:
+            return [step / self.n_betas for step in range(self.n_betas + 1)]
+        return [float(beta) for beta in self.betas]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Ais(_Annealing):
     r"""Estimates log Z of models too large to be enumerated; the estimate is too low on average.
 
     Annealed importance sampling from an RBM without couplings (Neal 2001; Salakhutdinov & Murray 2008):
@@ -76,13 +103,10 @@ class Ais:
     """
 
     n_chains: int = 100
-    n_betas: int = 1000
-    betas: Schedule | None = None
-    k: int = 1
 
     def __post_init__(self) -> None:
         require_count("n_chains", self.n_chains, 2)
-        object.__setattr__(self, "betas", _checked(self.n_betas, self.betas, self.k))
+        _Annealing.__post_init__(self)
 
     def estimate(
         self,
@@ -105,15 +129,15 @@ class Ais:
             SettingError: base has the wrong shape; a machine has more than two classes.
         """
         base = _base(model, base)
-        model, base = _two_layers(model, base)
-        start = torch.sigmoid(base).unsqueeze(-2).expand(*model.replicas, self.n_chains, model.n_visible)
+        rbm, base = as_two_layers(model).rbm, base_on_first_class(model, base)
+        start = torch.sigmoid(base).unsqueeze(-2).expand(*rbm.replicas, self.n_chains, rbm.n_visible)
         v = rng.bernoulli(start, generator=generator)
-        log_w = _anneal(model, v, base, _schedule(self.n_betas, self.betas), self.k, generator, progress)
-        return _summary(_log_z_of_base(model, base), log_w, 1)
+        log_w = _anneal(rbm, v, base, self._schedule(), self.k, generator, progress)
+        return _summary(rbm, base, log_w, 1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ReverseAis:
+class ReverseAis(_Annealing):
     r"""Estimates log Z from above, to see how far :class:`Ais` is off: the same path, from samples of the model.
 
     The mean weight is Z_0 / Z without bias; log Z is therefore too high on average. With ``Ais`` it brackets log Z
@@ -126,13 +150,6 @@ class ReverseAis:
         betas: The schedule itself, as that of ``Ais``, increasing from 0 to 1; None is linear.
         k: Gibbs sweeps at each beta, >= 1.
     """
-
-    n_betas: int = 1000
-    betas: Schedule | None = None
-    k: int = 1
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "betas", _checked(self.n_betas, self.betas, self.k))
 
     def estimate(
         self,
@@ -159,18 +176,8 @@ class ReverseAis:
         allowed = f"{(*model.replicas, 'n', model.n_visible)} with n >= 2"
         require(fits and v.shape[-2] >= 2, "shape of v", tuple(v.shape), allowed)
         base = _base(model, base)
-        betas = _schedule(self.n_betas, self.betas)[::-1]
-        log_w = _anneal(model, v.to(model.b), base, betas, self.k, generator, progress)
-        return _summary(_log_z_of_base(model, base), log_w, -1)
-
-
-def base_of(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_visible"]:
-    """Visible bias of the independent units that have the data's means: log (n_on + 1) / (n_off + 1).
-
-    >>> base_of(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
-    tensor([1.0986, 0.0000])
-    """
-    return mean_log_odds(v)
+        log_w = _anneal(model, v.to(model.b), base, self._schedule()[::-1], self.k, generator, progress)
+        return _summary(model, base, log_w, -1)
 
 
 @torch.no_grad()
@@ -216,22 +223,14 @@ def _draw(probability: Tensor, generator: Generator) -> Tensor:
     return rng.uniform(probability.shape, generator=generator, like=probability).lt_(probability)
 
 
-def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
-    """Estimate from weights whose mean is (Z / Z_0)^sign."""
+def _summary(model: RBM, base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
+    """Estimate from weights whose mean is (Z / Z_0)^sign, with Z_0 = 2^n_hidden prod_j (1 + exp(b_0j))."""
+    log_z_of_base = model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
     n = log_w.shape[-1]
     w = torch.exp(log_w - log_w.amax(-1, keepdim=True))
     log_mean = w.mean(-1).log() + log_w.amax(-1)
     error = w.std(-1) / (w.mean(-1) * n**0.5)
     return AisEstimate(log_z_of_base + sign * log_mean, error, w.sum(-1).square() / w.square().sum(-1), log_w)
-
-
-def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
-    """Log of Z_0 = 2^n_hidden prod_j (1 + exp(b_0j)), ``(*replicas,)`` float64."""
-    return model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
-
-
-def _two_layers(model: EnergyModel, base: Tensor) -> tuple[RBM, Tensor]:
-    return as_two_layers(model).rbm, base_on_first_class(model, base)
 
 
 def _base(model: EnergyModel, base: Tensor | None) -> Tensor:
@@ -242,20 +241,3 @@ def _base(model: EnergyModel, base: Tensor | None) -> Tensor:
     fits = base.shape in (shape, shape[-1:])
     require(fits, "shape of base", tuple(base.shape), f"{tuple(shape[-1:])} or {tuple(shape)}")
     return base.detach().to(model.b).expand(shape)
-
-
-def _checked(n_betas: int, betas: Schedule | None, k: int) -> tuple[float, ...] | None:
-    """Check the settings that both directions share; return the schedule as numbers."""
-    require_count("n_betas", n_betas)
-    require_count("k", k)
-    if betas is None:
-        return None
-    values = tuple(float(beta) for beta in betas)
-    increasing = len(values) >= 2 and all(low < high for low, high in pairwise(values))
-    rises = increasing and values[0] == 0.0 and values[-1] == 1.0
-    require(rises, "betas", betas, "numbers that increase from 0 to 1, both among them")
-    return values
-
-
-def _schedule(n_betas: int, betas: Schedule | None) -> list[float]:
-    return [step / n_betas for step in range(n_betas + 1)] if betas is None else [float(beta) for beta in betas]

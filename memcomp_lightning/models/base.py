@@ -79,19 +79,15 @@ class Chains(Protocol):
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw n states a replica, each unit 0 or 1 with probability 1/2."""
-        ...
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw every unit once given the others, at inverse temperature ``beta``, a number or ``(..., n, 1)``."""
-        ...
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         """Sweep, and return the energy of the new joint state as well, ``(*replicas, n)``."""
-        ...
 
     def read(self, x: Tensor) -> Configurations:
         """Return the states, one class (in an RBM the hidden units) replaced by its means given the others."""
-        ...
 
     def from_data(
         self, positive: Configurations, k: int, *, visible: Readout, hidden: Readout, generator: Generator
@@ -100,7 +96,6 @@ class Chains(Protocol):
 
         Other readouts than ``visible="sample"``, ``hidden="mean"`` need ``free_readout``.
         """
-        ...
 
 
 class EnergyModel(Protocol):
@@ -115,82 +110,64 @@ class EnergyModel(Protocol):
     @property
     def replicas(self) -> tuple[int, ...]:
         """Leading axes of independent models."""
-        ...
 
     @property
     def n_visible(self) -> int:
         """Number of visible units, which are numbered first."""
-        ...
 
     @property
     def n_hidden(self) -> int:
         """Number of hidden units."""
-        ...
 
     @property
     def n_units(self) -> int:
         """Number of all units."""
-        ...
 
     @property
     def n_enumerated(self) -> int:
         """Number of units whose states exact computations enumerate: all outside the largest class."""
-        ...
 
     def double(self) -> Self:
         """The model itself, with its numbers in float64 from now on."""
-        ...
 
     def parameters(self) -> Iterator[nn.Parameter]:
         """Couplings and biases."""
-        ...
 
     def energy(self, v: Tensor, h: Tensor) -> Tensor:
         """E(v, h) of each configuration, ``(*replicas, n)``."""
-        ...
 
     def total_energy(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor:
         """Sum of ``weight * E(v, h)`` over configurations, ``(*replicas,)``; weights of any sign."""
-        ...
 
     def centred_total_energy(
         self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
     ) -> Tensor:
         """The same sum; its gradient is that of the centred parametrisation, in the model's own parameters."""
-        ...
 
     def free_energy(self, v: Tensor) -> Tensor:
         """F(v), ``(*replicas, n)``; an upper bound where hidden units are coupled to each other."""
-        ...
 
     def hidden_mean(self, v: Tensor) -> Tensor:
         """E[h | v], in the mean field where hidden units are coupled to each other."""
-        ...
 
     @property
     def classes(self) -> Sequence[Tensor]:
         """Indices of the units of each class."""
-        ...
 
     def blocks(self) -> Sequence[Block]:
         """The classes of units, each with its couplings."""
-        ...
 
     def chains(self) -> Chains:
         """Gibbs chains at the present parameters."""
-        ...
 
     def all_configurations(self) -> Configurations:
         """All states outside the largest class with their probabilities as weights; that class by its means."""
-        ...
 
     def quadratic_form(self) -> QuadraticForm:
         """Couplings and biases as they stand in the energy."""
-        ...
 
     def two_layers(self) -> TwoLayers | None:
         """The RBM with the same energies; None where the units do not fall into two classes."""
-        ...
 
 
 def as_two_layers(model: EnergyModel) -> TwoLayers:

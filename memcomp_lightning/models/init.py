@@ -17,7 +17,6 @@ class Initialiser(Protocol):
 
     def __call__(self, shape: tuple[int, ...], *, generator: Generator) -> Tensor:
         """Return a tensor of this shape, drawn from ``generator``."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -16,7 +16,6 @@ class Randomiser(Protocol):
 
     def __call__(self, dbn: DBN, *, generator: Generator) -> None:
         """Change each layer of each replica on its own."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,20 +20,16 @@ class Graph(Protocol):
     @property
     def n(self) -> int:
         """Number of variables."""
-        ...
 
     @property
     def edge_shape(self) -> tuple[int, ...]:
         """Shape of one number a pair."""
-        ...
 
     def gather(self, x: Array) -> tuple[Array, Array]:
         """Values at the first and second variable of each pair, broadcastable to ``edge_shape``."""
-        ...
 
     def scatter(self, first: Array, second: Array) -> Array:
         """Sum per-pair numbers onto the first and the second variables: ``(*leading, n)``."""
-        ...
 
     def quadratic(self, coupling: Array, x: Array) -> Array:
         """``sum over pairs of coupling x_first x_second``: ``(*leading, n_states)``.
@@ -42,30 +38,24 @@ class Graph(Protocol):
             coupling: ``(*leading, *edge_shape)``.
             x: ``(*leading, n_states, n)``.
         """
-        ...
 
     def field(self, coupling: Array, x: Array) -> Array:
         """Derivative of :meth:`quadratic` by x: ``(*leading, n_states, n)``."""
-        ...
 
     def alternating(self) -> Array:
         """In which of two ways ``from_qubo`` makes a clause of each pair: +1 or -1, ``edge_shape``, in numpy.
 
         Every variable has about as many of each, so that its unit clauses largely cancel.
         """
-        ...
 
     def blocks(self) -> Iterator[slice]:
         """Slices of variables that are not coupled to each other, in order, covering all."""
-        ...
 
     def alike(self, like: AnyArray) -> "Graph":
         """The same pairs in the library and on the device of ``like``."""
-        ...
 
     def edges(self) -> Array:
         """The pairs as ``(n_pairs, 2)``, in the order of a flattened per-pair array."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

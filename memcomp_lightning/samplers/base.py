@@ -84,7 +84,6 @@ class NegativePhaseSampler(Protocol[ModelT, StateT]):
             n_chains: Number of chains a replica, unless the sampler has a number of its own.
             generator: Random stream of the negative phase.
         """
-        ...
 
     def sample(
         self, model: ModelT, state: StateT, positive: Configurations, *, generator: Generator
@@ -98,4 +97,3 @@ class NegativePhaseSampler(Protocol[ModelT, StateT]):
                 hidden means given it.
             generator: Random stream of the negative phase.
         """
-        ...

@@ -67,9 +67,8 @@ class ParallelTempering:
         if self.n_chains is not None:
             require_count("n_chains", self.n_chains)
         require_count("n_temperatures", self.n_temperatures, minimum=2)
-        require(
-            0 < self.target_swap_rate < 1, "target_swap_rate", self.target_swap_rate, "a number between 0 and 1"
-        )
+        rate = self.target_swap_rate
+        require(0 < rate < 1, "target_swap_rate", rate, "a number between 0 and 1")
         require(self.adaptation >= 0, "adaptation", self.adaptation, "a number >= 0")
 
     def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> Ladder:
@@ -119,7 +118,9 @@ class ParallelTempering:
         x, last_end = _exchanged(x.view(shape), swaps.unsqueeze(-1), cold, hot), state.last_end
         last_end = _exchanged(last_end.unsqueeze(-1), swaps.unsqueeze(-1), cold, hot).squeeze(-1)
         home = last_end[..., 0, :] == -1
-        last_end[..., 0, :], last_end[..., -1, :] = 1.0, _down(last_end[..., -1, :])
+        # At the hottest temperature, states that came from the coldest one are on their way back.
+        last_end[..., -1, :] = torch.where(last_end[..., -1, :] == 0, last_end[..., -1, :], -1.0)
+        last_end[..., 0, :] = 1.0
         return self._adapted(state, swaps.to(x.dtype).mean(-1), cold)._replace(
             x=x,
             last_end=last_end,
@@ -150,8 +151,3 @@ def _exchanged(x: Tensor, swaps: Tensor, cold: slice, hot: slice) -> Tensor:
         torch.where(swaps, x[..., cold, :, :], x[..., hot, :, :]),
     )
     return x
-
-
-def _down(last_end: Tensor) -> Tensor:
-    """At the hottest temperature: states that came from the coldest one are on their way back."""
-    return torch.where(last_end == 0, last_end, -1.0)

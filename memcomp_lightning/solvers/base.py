@@ -49,11 +49,9 @@ class RecordedStates(Protocol):
     @property
     def assignments(self) -> Array:
         """``(*problems, n_restarts, n_records, n)``, bool."""
-        ...
 
     def weights(self) -> Array:
         """How much each of them counts in an average, >= 0, ``(*problems, n_restarts, n_records)``."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,4 +108,3 @@ class QuboSolver(Protocol):
             qubo: One or many problems of one graph.
             generator: The source of random numbers, of numpy or torch, whatever the problem is made of.
         """
-        ...

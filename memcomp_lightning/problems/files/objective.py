@@ -37,11 +37,9 @@ class Counting(Protocol):
     @property
     def n_hard(self) -> int:
         """Number of hard clauses."""
-        ...
 
     def count(self, x: Bits) -> Score:
         """The score of one state ``x (n,)``."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,6 @@ class HasVoltage(Protocol):
     @property
     def voltage(self) -> Array:
         """``(*problems, n_restarts, n)`` in [-1, 1]; > 0 reads as TRUE."""
-        ...
 
 
 class VectorField(Protocol[MachineT, StateT]):
@@ -32,37 +31,29 @@ class VectorField(Protocol[MachineT, StateT]):
     @property
     def integrator(self) -> "Integrator":
         """The scheme that the constants were chosen with."""
-        ...
 
     @property
     def noise(self) -> float:
         """Width of the uniform noise on the voltages per square root of machine time, >= 0."""
-        ...
 
     @property
     def spread(self) -> float:
         """Initial voltages are uniform in [-spread, spread], in (0, 1]."""
-        ...
 
     def build(self, problem: Qubo | WeightedMaxSat) -> MachineT:
         """Scale a problem into the machine's units."""
-        ...
 
     def stability(self, machine: MachineT) -> Array:
         """Factor > 0 on ``StepControl.change``, so that steps suit the problem's size, ``(*problems, 1)``."""
-        ...
 
     def init(self, machine: MachineT, voltage: Array) -> StateT:
         """The state at the start: voltages ``(*problems, n_restarts, n)`` as given, and their memories."""
-        ...
 
     def derivative(self, machine: MachineT, state: StateT) -> StateT:
         """Right-hand side of the ODE, one array for each of the state's."""
-        ...
 
     def bound(self, machine: MachineT, state: StateT) -> StateT:
         """Project voltages and memories onto their intervals."""
-        ...
 
 
 class Recording(NamedTuple):

@@ -56,7 +56,6 @@ class Integrator(Protocol):
             before: ``Step.rate`` of the step that led here; None at the start.
             shake: Adds the noise of a step to the voltages, once they have moved and before they are bounded.
         """
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
