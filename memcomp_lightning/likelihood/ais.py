@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
 from torch import Generator, Tensor
 from tqdm.auto import tqdm
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
-from memcomp_lightning.models.base import EnergyModel, as_two_layers
+from memcomp_lightning.models.base import EnergyModel, Visible, as_two_layers
 from memcomp_lightning.models.init import mean_log_odds
 from memcomp_lightning.models.rbm import RBM
 
@@ -154,7 +153,7 @@ class ReverseAis(_Annealing):
     def estimate(
         self,
         model: RBM,
-        v: Float[Tensor, "*replicas n n_visible"],
+        v: Visible,
         *,
         generator: Generator,
         base: Tensor | None = None,

@@ -4,13 +4,12 @@ import copy
 import math
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.layers import softplus
-from memcomp_lightning.models.base import Block, EnergyModel
+from memcomp_lightning.models.base import Block, EnergyModel, Images, PerReplica, PerState
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
 
 _NUMBERS = 2**23
@@ -26,7 +25,7 @@ def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Float[Tensor, "*replicas"]:
+def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> PerReplica:
     """Log Z by enumerating all units outside the largest class."""
     model = _double(model)
     blocks = model.blocks()
@@ -46,7 +45,7 @@ def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Flo
 
 
 @torch.no_grad()
-def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> Float[Tensor, "*replicas n"]:
+def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> PerState:
     """Log of the sum over h of exp(-E(v, h)), by enumerating all hidden units outside their largest class."""
     model = _double(model)
     v = v.double().expand(*model.replicas, *v.shape[-2:])
@@ -71,12 +70,12 @@ def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> Float[Tenso
 @torch.no_grad()
 def log_likelihood_bound(
     model: EnergyModel,
-    v: Float[Tensor, "*axes n n_visible"],
-    log_z: Float[Tensor, "*replicas"],
+    v: Images,
+    log_z: PerReplica,
     *,
     max_iterations: int = 100,
     tolerance: float = 1e-4,
-) -> Float[Tensor, "*replicas n"]:
+) -> PerState:
     r"""Return the mean-field lower bound of log p(v).
 
     .. math:: \log p(v) \ge -E(v, \mu) + \sum_i H(\mu_i) - \log Z

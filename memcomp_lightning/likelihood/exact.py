@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
@@ -16,7 +15,7 @@ from memcomp_lightning.likelihood.boltzmann import (
 )
 from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.models.base import EnergyModel, as_two_layers
+from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible, as_two_layers
 from memcomp_lightning.models.rbm import RBM
 
 MOST_HIDDEN = 16
@@ -27,9 +26,7 @@ _NUMBERS = 2**23
 
 
 @torch.no_grad()
-def log_partition_function(
-    model: EnergyModel, *, max_units: int = 25, progress: bool = False
-) -> Float[Tensor, "*replicas"]:
+def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress: bool = False) -> PerReplica:
     r"""Return log Z, by enumerating the smaller layer.
 
     .. math:: Z = \sum_s exp(g.s) \prod_i (1 + exp(W s + c)_i)
@@ -60,9 +57,7 @@ def log_partition_function(
 
 
 @torch.no_grad()
-def exact_samples(
-    model: RBM, n: int, *, generator: Generator, max_units: int = 25
-) -> Float[Tensor, "*replicas n n_visible"]:
+def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 25) -> Visible:
     """Draw independent visible states from the model, by enumerating the smaller layer.
 
     Args:
@@ -104,9 +99,7 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
 
 
 @torch.no_grad()
-def log_likelihood(
-    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
-) -> Float[Tensor, "*replicas n"]:
+def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
     """Return log p(v) = -F(v) - log Z of each image.
 
     In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
@@ -136,9 +129,7 @@ def log_likelihood(
     return _in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
 
 
-def log_likelihood_or_bound(
-    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"], log_z: Float[Tensor, "*replicas"]
-) -> Float[Tensor, "*replicas n"]:
+def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
     """:func:`log_likelihood`, or :func:`log_likelihood_bound` of a machine with more than 16 hidden units."""
     if model.n_hidden > MOST_HIDDEN and _as_rbm(model) is None:
         return log_likelihood_bound(model, v, log_z)
@@ -148,9 +139,9 @@ def log_likelihood_or_bound(
 @torch.no_grad()
 def kl_divergence(
     model: EnergyModel,
-    v: Float[Tensor, "*axes n n_visible"],
-    log_z: Float[Tensor, "*replicas"] | None = None,
-) -> Float[Tensor, "*replicas"]:
+    v: Images,
+    log_z: PerReplica | None = None,
+) -> PerReplica:
     r"""Return the divergence of the model from the empirical distribution of the rows of v.
 
     .. math:: KL(p_v || p) = \sum_x p_v(x) (log p_v(x) - log p(x))
@@ -183,9 +174,7 @@ def _log_shares(rows: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def log_pseudo_likelihood(
-    model: EnergyModel, v: Float[Tensor, "*axes n n_visible"]
-) -> Float[Tensor, "*replicas n n_visible"]:
+def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
     r"""Return log p(v_j | all other v) of each unit j of each image; needs no log Z.
 
     .. math:: log p(v_j | v_{-j}) = -softplus(F(v) - F(v'))

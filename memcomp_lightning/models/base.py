@@ -15,6 +15,17 @@ if TYPE_CHECKING:
 
 Readout = Literal["mean", "sample"]
 
+Visible = Float[Tensor, "*replicas n n_visible"]
+"""Values of the visible units in n configurations."""
+Hidden = Float[Tensor, "*replicas n n_hidden"]
+"""Values of the hidden units."""
+PerState = Float[Tensor, "*replicas n"]
+"""One number a configuration."""
+PerReplica = Float[Tensor, "*replicas"]
+"""One number a replica."""
+Images = Float[Tensor, "*axes n n_visible"]
+"""Data with the replica axes of a model, or without any."""
+
 
 class Block(NamedTuple):
     """What it takes to draw one class of units given all others: its couplings and biases, as they are now.

@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
+from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
 from memcomp_lightning.models.init import Gaussian, Initialiser
@@ -223,9 +223,7 @@ class BoltzmannMachine(Machine):
         weight: Tensor = flat.index_copy(-1, at, self.coupling[..., across]).unflatten(-1, (self.n_hidden, n))
         return weight
 
-    def energy(
-        self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
-    ) -> Float[Tensor, "*replicas n"]:
+    def energy(self, v: Visible, h: Hidden) -> PerState:
         """E(v, h) of each configuration."""
         x = torch.cat((v, h), dim=-1)
         coupled = sum(
@@ -261,15 +259,15 @@ class BoltzmannMachine(Machine):
         total: Tensor = -(vecdot(self.coupling, of_pairs) + vecdot(self.bias, of_units))
         return total
 
-    def hidden_mean(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
+    def hidden_mean(self, v: Visible) -> Hidden:
         """E[h | v]: exact if no two hidden units are coupled, otherwise by :func:`mean_field`, its defaults."""
         return mean_field(self, v).h
 
-    def visible_mean(self, h: Float[Tensor, "*replicas n n_hidden"]) -> Float[Tensor, "*replicas n n_visible"]:
+    def visible_mean(self, h: Hidden) -> Visible:
         """E[v | h]: exact if no two visible units are coupled, otherwise by the mean field."""
         return mean_field(self, h, clamped="hidden").h
 
-    def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
+    def free_energy(self, v: Visible) -> PerState:
         r"""The mean-field free energy, ``E(v, m) - \sum_i H(m_i)`` with the means m of the hidden units.
 
         It is F(v) if no two hidden units are coupled, and above it otherwise.

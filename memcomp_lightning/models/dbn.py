@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.base import Hidden, Visible
 from memcomp_lightning.models.init import Initialiser
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.rng import stream
@@ -74,21 +75,17 @@ class DBN(nn.Module):
         """Leading axes of independent networks."""
         return self[0].replicas
 
-    def visible_of(
-        self, layer: int, v: Float[Tensor, "*replicas n n_visible"]
-    ) -> Float[Tensor, "*replicas n n_layer_visible"]:
+    def visible_of(self, layer: int, v: Visible) -> Float[Tensor, "*replicas n n_layer_visible"]:
         """What the RBM of ``layer`` sees when the network sees ``v``: the mean activations below it."""
         for rbm in self.rbms[:layer]:
             v = rbm(v)
         return v
 
-    def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
+    def forward(self, v: Visible) -> Hidden:
         """Mean activations of the top layer."""
         return self.visible_of(len(self), v)
 
-    def images_of(
-        self, layer: int, x: Float[Tensor, "*replicas n n_layer_visible"]
-    ) -> Float[Tensor, "*replicas n n_visible"]:
+    def images_of(self, layer: int, x: Float[Tensor, "*replicas n n_layer_visible"]) -> Visible:
         """Project visible states of ``layer`` down to the inputs by the conditional means."""
         with torch.no_grad():
             for below in reversed(range(layer)):

@@ -11,6 +11,7 @@ from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.base import Visible
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.rng import stream
@@ -134,7 +135,7 @@ class BatchNormReluNetwork(nn.Module):
         layers.append(linear(sizes[-1], n_classes))
         self.layers = nn.Sequential(*layers)
 
-    def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_classes"]:
+    def forward(self, v: Visible) -> Float[Tensor, "*replicas n n_classes"]:
         """Class logits."""
         logits: Tensor = self.layers(v)
         return logits

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.base import EnergyModel, Images
 
 
 class Initialiser(Protocol):
@@ -63,7 +63,7 @@ class Xavier:
         return _empty(shape, generator).uniform_(-bound, bound, generator=generator)
 
 
-def mean_log_odds(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes n_visible"]:
+def mean_log_odds(v: Images) -> Float[Tensor, "*axes n_visible"]:
     """Biases of independent units that have the data's means: log (n_on + 1) / (n_off + 1).
 
     >>> mean_log_odds(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
@@ -74,7 +74,7 @@ def mean_log_odds(v: Float[Tensor, "*axes n n_visible"]) -> Float[Tensor, "*axes
 
 
 @torch.no_grad()
-def start_at_means(model: EnergyModel, v: Float[Tensor, "*axes n n_visible"]) -> None:
+def start_at_means(model: EnergyModel, v: Images) -> None:
     """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
 
     Hinton 2012, A Practical Guide to Training RBMs, section 8.1.

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from memcomp_lightning.ambient import in_own_dtypes
+from memcomp_lightning.models.base import Hidden, PerReplica, PerState, Visible
 from memcomp_lightning.objective import shares
 from memcomp_lightning.types import Configurations
 
@@ -42,17 +43,12 @@ class Machine(nn.Module):
         """Leading axes of independent machines."""
         return tuple(self.b.shape[:-1])
 
-    def mean_energy(self, configurations: Configurations) -> Float[Tensor, "*replicas"]:
+    def mean_energy(self, configurations: Configurations) -> PerReplica:
         """Mean of E over configurations, by their weights."""
         return self.total_energy(configurations.v, configurations.h, shares(configurations))
 
     @in_own_dtypes
-    def total_energy(
-        self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
-    ) -> Float[Tensor, "*replicas"]:
+    def total_energy(self, v: Visible, h: Hidden, weight: PerState) -> PerReplica:
         """Weighted sum of E over configurations, constants to autograd; the weights may have any sign."""
         with torch.no_grad():
             moments = self._moments(v, h, weight)
@@ -61,12 +57,12 @@ class Machine(nn.Module):
     @in_own_dtypes
     def centred_total_energy(
         self,
-        v: Float[Tensor, "*replicas n n_visible"],
-        h: Float[Tensor, "*replicas n n_hidden"],
-        weight: Float[Tensor, "*replicas n"],
+        v: Visible,
+        h: Hidden,
+        weight: PerState,
         visible_offset: Float[Tensor, "*replicas n_visible"],
         hidden_offset: Float[Tensor, "*replicas n_hidden"],
-    ) -> Float[Tensor, "*replicas"]:
+    ) -> PerReplica:
         """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
 
         (Montavon & Mueller 2012.)

@@ -3,10 +3,9 @@
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from memcomp_lightning.models.base import Block, EnergyModel
+from memcomp_lightning.models.base import Block, EnergyModel, Hidden, PerState, Visible
 
 
 class MeanFieldSolution(NamedTuple):
@@ -78,9 +77,7 @@ def mean_field(
     return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations)
 
 
-def free_energy_of_means(
-    model: EnergyModel, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
-) -> Float[Tensor, "*replicas n"]:
+def free_energy_of_means(model: EnergyModel, v: Visible, h: Hidden) -> PerState:
     r"""``E(v, m) - \sum_i H(m_i)`` of given means m of the hidden units: an upper bound of F(v)."""
     negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
     return model.energy(v, h) + negative_entropy

@@ -4,14 +4,13 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
-from memcomp_lightning.models.base import Block, QuadraticForm, TwoLayers
+from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Gaussian, Initialiser
 from memcomp_lightning.models.machine import Machine
@@ -64,9 +63,7 @@ class RBM(Machine):
         self.b = nn.Parameter(weight.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(weight.new_zeros(*replicas, n_hidden))
 
-    def energy(
-        self, v: Float[Tensor, "*replicas n n_visible"], h: Float[Tensor, "*replicas n n_hidden"]
-    ) -> Float[Tensor, "*replicas n"]:
+    def energy(self, v: Visible, h: Hidden) -> PerState:
         """E(v, h) of each configuration (eq. 3)."""
         hidden_part = (self.hidden_field(v) * h).sum(-1)
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
@@ -91,31 +88,27 @@ class RBM(Machine):
         biases: Tensor = vecdot(self.b, of_b) + vecdot(self.c, of_c)
         return -(coupled + biases)
 
-    def free_energy(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n"]:
+    def free_energy(self, v: Visible) -> PerState:
         r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
         return -F.softplus(self.hidden_field(v)).sum(-1) - (v * self.b.unsqueeze(-2)).sum(-1)
 
-    def hidden_free_energy(self, h: Float[Tensor, "*replicas n n_hidden"]) -> Float[Tensor, "*replicas n"]:
+    def hidden_free_energy(self, h: Hidden) -> PerState:
         r"""F(h) = -c.h - \sum_j softplus(W^T h + b)_j, so that p(h) = exp(-F(h)) / Z."""
         return -F.softplus(self.visible_field(h)).sum(-1) - (h * self.c.unsqueeze(-2)).sum(-1)
 
-    def hidden_field(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
+    def hidden_field(self, v: Visible) -> Hidden:
         """W v + c, the log odds of each hidden unit."""
         return affine(v, self.weight, self.c)
 
-    def visible_field(self, h: Float[Tensor, "*replicas n n_hidden"]) -> Float[Tensor, "*replicas n n_visible"]:
+    def visible_field(self, h: Hidden) -> Visible:
         """W^T h + b, the log odds of each visible unit."""
         return affine(h, self.weight.mT, self.b)
 
-    def hidden_mean(
-        self, v: Float[Tensor, "*replicas n n_visible"], *, beta: float | Tensor = 1.0
-    ) -> Float[Tensor, "*replicas n n_hidden"]:
+    def hidden_mean(self, v: Visible, *, beta: float | Tensor = 1.0) -> Hidden:
         """p(h = 1 | v) at inverse temperature ``beta`` (eq. 7), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.hidden_field(v), beta))
 
-    def visible_mean(
-        self, h: Float[Tensor, "*replicas n n_hidden"], *, beta: float | Tensor = 1.0
-    ) -> Float[Tensor, "*replicas n n_visible"]:
+    def visible_mean(self, h: Hidden, *, beta: float | Tensor = 1.0) -> Visible:
         """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
         return torch.sigmoid(_scaled(self.visible_field(h), beta))
 
@@ -159,7 +152,7 @@ class RBM(Machine):
         """Itself."""
         return TwoLayers(self, None)
 
-    def forward(self, v: Float[Tensor, "*replicas n n_visible"]) -> Float[Tensor, "*replicas n n_hidden"]:
+    def forward(self, v: Visible) -> Hidden:
         """The layer as part of a feed-forward network: p(h = 1 | v)."""
         return self.hidden_mean(v)
 
