@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +12,21 @@ from numpy.typing import NDArray
 from memcomp_lightning.arrays import Array, to_numpy
 from memcomp_lightning.errors import require, require_choice
 from memcomp_lightning.problems.files.formats import FORMATS, guess
-from memcomp_lightning.problems.files.objective import ClauseList, Objective, Score
+from memcomp_lightning.problems.files.objective import ClauseList, Parsed, Score
 from memcomp_lightning.problems.files.source import ProblemFileError, Source, stem, unpacked
-from memcomp_lightning.problems.maxsat import WeightedMaxSat
-from memcomp_lightning.problems.qubo import Qubo
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """A problem and the file that it comes from.
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Problem(Parsed):
+    """A problem and the file that it comes from: :class:`Parsed`, what stands there, with its name.
 
     Attributes:
-        problem: What to minimise, in float64, over those variables that the file uses.
         path: The file.
         format: Its format, a key of :data:`FORMATS`.
-        objective: What the file's authors count.
-        n: Number of variables of the file.
-        variables: ``(n_used,)`` int64, the variables of ``problem`` among those of the file, counted from 0.
-        remarks: What a person should know of how the file was read, a sentence each.
-        integers: ``problem`` as integers, for solvers that prove; None where int64 does not hold its sums, or for
-            clauses of three literals and more.
-        resolved: Whether float64 tells apart all energies that differ.
     """
 
-    problem: Qubo | WeightedMaxSat
     path: Path
     format: str
-    objective: Objective
-    n: int
-    variables: NDArray[np.int64]
-    remarks: tuple[str, ...] = ()
-    integers: Qubo | None = None
-    resolved: bool = True
 
     @property
     def name(self) -> str:
@@ -55,8 +38,8 @@ class Problem:
         """How many variables, and couplings or clauses."""
         if not isinstance(self.objective.counting, ClauseList):
             return {"variables": self.n, "couplings": math.prod(self.problem.graph.edge_shape)}
-        n_hard = self.objective.counting.n_hard
-        sizes = {"variables": self.n, "clauses": len(self.objective.counting.hard)}
+        hard = self.objective.counting.hard
+        sizes, n_hard = {"variables": self.n, "clauses": len(hard)}, int(hard.sum())
         return {**sizes, "hard_clauses": n_hard} if n_hard else sizes
 
     @property
@@ -104,24 +87,10 @@ def read_problem(path: str | Path, format: str | None = None, *, maximise: bool 
         require_choice("format", format, FORMATS)
     source = Source(path, _read(path))
     name = _format_of(source) if format is None else format
-    require(
-        not maximise or FORMATS[name].either_way or name == "gset",
-        "maximise",
-        maximise,
-        f"false for a file of format {name!r}",
-    )
+    fits = not maximise or FORMATS[name].either_way or name == "gset"
+    require(fits, "maximise", maximise, f"false for a file of format {name!r}")
     parsed = FORMATS[name].parse(source, maximise)
-    return Problem(
-        problem=parsed.problem,
-        path=path,
-        format=name,
-        objective=parsed.objective,
-        n=parsed.n,
-        variables=parsed.variables,
-        remarks=parsed.remarks,
-        integers=parsed.integers,
-        resolved=parsed.resolved,
-    )
+    return Problem(path=path, format=name, **{part.name: getattr(parsed, part.name) for part in fields(parsed)})
 
 
 def _read(path: Path) -> bytes:

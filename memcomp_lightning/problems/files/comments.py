@@ -25,14 +25,14 @@ _MEANING = re.compile(
 )
 
 
-def unread(lines: list[str], counted: tuple[str, ...] = ()) -> list[str]:
+def unread(lines: list[str], counted: tuple[str, ...] = (), names: re.Pattern[str] = _MEANING) -> list[str]:
     """A remark on each comment that seems to change what the numbers mean; names in ``counted`` get none."""
     if not holds(lines, "=:"):
         return []
     return [
         f"Line {at}: {quoted(match[0])} stands in a comment and is not read."
         for at, text in comments(lines)
-        for match in _MEANING.finditer(text)
+        for match in names.finditer(text)
         if match[1].lower() not in counted
     ]
 

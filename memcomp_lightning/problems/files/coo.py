@@ -2,7 +2,7 @@
 
 import re
 
-from memcomp_lightning.problems.files.comments import IS, comments, constant, said
+from memcomp_lightning.problems.files.comments import IS, comments, constant, said, unread
 from memcomp_lightning.problems.files.objective import Parsed, Terms, from_terms
 from memcomp_lightning.problems.files.source import MOST_VARIABLES, Source, quoted
 from memcomp_lightning.problems.files.table import Table
@@ -10,6 +10,7 @@ from memcomp_lightning.problems.files.table import Table
 _VARTYPE = re.compile(rf"\bvar[-_ ]?type\b{IS}(?:dimod\.)?(?:vartype\.)?(?P<value>spin|binary)\b", re.IGNORECASE)
 _NAMES_VARTYPE = re.compile(r"var[-_ ]?type", re.IGNORECASE)
 _SPINS = re.compile(r"\bspins?\b|\bising\b", re.IGNORECASE)
+_COUNTED = ("offset", "constant", "vartype", "var_type", "var-type")
 _OTHER = re.compile(r"[\"']?\b([A-Za-z_][\w-]*)[\"']?\s*[:=]\s*([^\s,;}]+)", re.ASCII)
 
 
@@ -34,12 +35,7 @@ def parse(source: Source, maximise: bool) -> Parsed:
     n = 1 + max(int(i.max(initial=-1)), int(j.max(initial=-1)))
     remarks = [] if len(table.values) else ["There are no entries: the sum is empty."]
     remarks += [] if offset is None else [f"The offset {offset} is counted."]
-    remarks += [
-        f"Line {at}: {quoted(match[0])} stands in a comment and is not read."
-        for at, text in comments(lines)
-        for match in _OTHER.finditer(text)
-        if not _NAMES_VARTYPE.fullmatch(match[1]) and match[1].lower() not in ("offset", "constant")
-    ]
+    remarks += unread(lines, _COUNTED, _OTHER)
     return from_terms(source, f"{kind} energy", n, terms, maximised=maximise, remarks=remarks)
 
 

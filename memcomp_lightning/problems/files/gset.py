@@ -2,20 +2,17 @@
 
 import numpy as np
 
-from memcomp_lightning.problems.files.comments import unread
 from memcomp_lightning.problems.files.objective import Parsed, Terms, from_terms
 from memcomp_lightning.problems.files.source import Source
-from memcomp_lightning.problems.files.table import Header, Table
+from memcomp_lightning.problems.files.table import Table
 
 
 def parse(source: Source, maximise: bool) -> Parsed:
     """MAX-CUT, maximised in any case. The energy is -cut = sum of w (2 x_i x_j - x_i - x_j)."""
     lines = source.lines()
-    header = Header.read(source, lines, "vertices", "edges")
-    table = Table.after(header, source, lines, "edges", columns=(3, 2))
-    i, j = table.pairs(1, max(header.n, 1), "vertices")
+    n, table, remarks = Table.after_header(source, lines, "vertices", "edges", columns=(3, 2))
+    i, j = table.pairs(1, max(n, 1), "vertices")
     loops = np.flatnonzero(i == j)
-    remarks = [*header.remarks(), *unread(lines)]
     if len(loops):
         number, line = table.row(int(loops[0]))
         remarks.append(
@@ -23,4 +20,4 @@ def parse(source: Source, maximise: bool) -> Parsed:
             "adds nothing to a cut. In x'Qx it would: format=beasley."
         )
     terms = Terms("cut", i, j, table.numbers())
-    return from_terms(source, "cut weight", header.n, terms, maximised=True, remarks=remarks)
+    return from_terms(source, "cut weight", n, terms, maximised=True, remarks=remarks)

@@ -33,7 +33,7 @@ def parse(source: Source, maximise: bool) -> Parsed:
     else:
         if pattern:
             raise source.fault("an array of pattern", "coordinates of a pattern", 1)
-        table = Table.column(source, lines, at)
+        table = Table.read(source, lines, at, (1,))
         j, i = np.triu_indices(n) if symmetric else np.indices((n, n)).reshape(2, -1)
         n_entries = len(i)
     if len(table.values) != n_entries:

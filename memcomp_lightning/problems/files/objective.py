@@ -34,10 +34,6 @@ class Score(NamedTuple):
 class Counting(Protocol):
     """How an assignment is counted."""
 
-    @property
-    def n_hard(self) -> int:
-        """Number of hard clauses."""
-
     def count(self, x: Bits) -> Score:
         """The score of one state ``x (n,)``."""
 
@@ -69,18 +65,19 @@ class Objective:
         return value + self.penalty * score.hard_unsatisfied if score.hard_unsatisfied else value
 
 
-class Parsed(NamedTuple):
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+class Parsed:
     """What stands in a file.
 
     Attributes:
-        problem: What to minimise over the variables that the file uses, in float64.
-        objective: What is counted.
+        problem: What to minimise, in float64, over those variables that the file uses.
+        objective: What the file's authors count.
         n: Number of variables of the file.
-        variables: ``(n_used,)`` int64, those that it uses, counted from 0.
+        variables: ``(n_used,)`` int64, the variables of ``problem`` among those of the file, counted from 0.
         remarks: What a person should know of how the file was read, a sentence each.
-        integers: The same problem in integers, energies in units of ``10^-decimals``; None where int64 does not
-            hold its sums, or for clauses of three literals and more.
-        resolved: Whether energies that differ do so in float64: sums round to less than their smallest difference.
+        integers: ``problem`` as integers, in units of its numbers' last digit, for solvers that prove; None where
+            int64 does not hold its sums, or for clauses of three literals and more.
+        resolved: Whether float64 tells apart all energies that differ.
     """
 
     problem: Qubo | WeightedMaxSat
@@ -111,11 +108,6 @@ class Terms:
     i: NDArray[np.int64]
     j: NDArray[np.int64]
     numbers: Numbers
-
-    @property
-    def n_hard(self) -> int:
-        """None is hard."""
-        return 0
 
     def count(self, x: Bits) -> Score:
         """The sum, without rounding."""
@@ -151,9 +143,15 @@ def from_terms(
         size = sum(int(abs(part).sum()) for part in parts)
         problem = Qubo(integers.graph, *(double(part) / 10**numbers.decimals for part in parts))
     said = [*remarks, *_repeated(i, j, problem), *_rounding(numbers.exact(size), size)]
-    objective = Objective(name, terms, maximised)
-    resolved = _resolved(size, numbers.decimals, len(i))
-    return Parsed(problem, objective, n, used.astype(np.int64), tuple(said), integers, resolved)
+    return Parsed(
+        problem=problem,
+        objective=Objective(name, terms, maximised),
+        n=n,
+        variables=used.astype(np.int64),
+        remarks=tuple(said),
+        integers=integers,
+        resolved=_resolved(size, numbers.decimals, len(i)),
+    )
 
 
 def _as_qubo(terms: Terms, n: int, values: NDArray[Any]) -> Qubo:
@@ -241,11 +239,6 @@ class ClauseList:
     weight: Numbers
     hard: Bits
 
-    @property
-    def n_hard(self) -> int:
-        """Number of hard clauses."""
-        return int(self.hard.sum())
-
     def count(self, x: Bits) -> Score:
         """Weight of the unsatisfied soft clauses, number of the unsatisfied hard ones."""
         true = x[np.abs(self.literals) - 1] == (self.literals > 0)
@@ -284,9 +277,15 @@ def from_clauses(
     empty = [f"{n_empty} hard clause{'s are' if n_empty > 1 else ' is'} empty: no assignment satisfies all."]
     said = [*remarks, *(empty if n_empty else ()), *_rounding(soft.exact(size), size)]
     listed = ClauseList(flat, np.repeat(np.arange(len(clauses)), lengths), soft, is_hard)
-    objective = Objective(name, listed, penalty=soft.exact(penalty))
-    resolved = _resolved(size, soft.decimals, len(clauses))
-    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved)
+    return Parsed(
+        problem=problem,
+        objective=Objective(name, listed, penalty=soft.exact(penalty)),
+        n=n,
+        variables=used - 1,
+        remarks=tuple(said),
+        integers=integers,
+        resolved=_resolved(size, soft.decimals, len(clauses)),
+    )
 
 
 def _penalty(total: int, one: int) -> int:
@@ -315,11 +314,6 @@ class RbmEnergy:
     weight: NDArray[np.float64]
     b: NDArray[np.float64]
     c: NDArray[np.float64]
-
-    @property
-    def n_hard(self) -> int:
-        """None is hard."""
-        return 0
 
     def count(self, x: Bits) -> Score:
         """The energy: the sum of what is on, whatever its order."""

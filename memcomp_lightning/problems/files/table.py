@@ -2,56 +2,26 @@
 
 import re
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from memcomp_lightning.problems.files.comments import unread
 from memcomp_lightning.problems.files.numbers import MOST_DIGITS, NUMBER, Numbers, fits
 from memcomp_lightning.problems.files.source import Source, counts, filled, holds, is_comment, quoted
 
 HEADER = re.compile(r"\s*(\d+)\s+(\d+)(\s|$)", re.ASCII)
 
 
-class Header(NamedTuple):
-    """The line before a table.
-
-    Attributes:
-        line: Its number.
-        n: Number of variables.
-        n_entries: Number of rows that follow.
-        rest: What stands behind the two numbers.
-    """
-
-    line: int
-    n: int
-    n_entries: int
-    rest: str
-
-    @staticmethod
-    def read(source: Source, lines: list[str], variables: str, entries: str) -> "Header":
-        """The first line that is no comment: numbers of variables and entries, and perhaps words."""
-        at, header = next(filled(lines), (1, lines[0]))
-        match = HEADER.match(header)
-        if match is None:
-            raise source.fault(quoted(header), f"the numbers of {variables} and {entries}", at)
-        n, n_entries = counts(source, at, [match[1], match[2]])
-        return Header(at, n, n_entries, header[match.end(2) :].partition("#")[0].strip())
-
-    def remarks(self) -> list[str]:
-        """What of the line is not read."""
-        return [f"Line {self.line}: {quoted(self.rest)} after the two numbers is not read."] if self.rest else []
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Lines of two or three numbers.
+    """Lines of one to three numbers.
 
     Attributes:
         source: The file.
         lines: All of its lines.
         first: How many of them come before the table.
-        values: ``(n_rows, 3)``, rounded to float64; a third number that is left out is 1.
+        values: ``(n_rows, 3)``, rounded to float64; a third number that is left out is 1, one alone is the third.
         width: Numbers a line.
     """
 
@@ -62,13 +32,24 @@ class Table:
     width: int = 3
 
     @staticmethod
-    def after(header: Header, source: Source, lines: list[str], entries: str, columns: tuple[int, ...]) -> "Table":
-        """The table after a header, which says how many rows it has."""
-        table = Table.read(source, lines, header.line, columns)
-        if len(table.values) != header.n_entries:
-            expected = f"{header.n_entries}, the second number of line {header.line}"
-            raise source.fault(f"{len(table.values)} {entries}", expected)
-        return table
+    def after_header(
+        source: Source, lines: list[str], variables: str, entries: str, columns: tuple[int, ...]
+    ) -> tuple[int, "Table", list[str]]:
+        """The number of variables, the rows, and remarks on what is not read.
+
+        The first line that is no comment says how many variables and rows there are.
+        """
+        at, header = next(filled(lines), (1, lines[0]))
+        match = HEADER.match(header)
+        if match is None:
+            raise source.fault(quoted(header), f"the numbers of {variables} and {entries}", at)
+        n, n_entries = counts(source, at, [match[1], match[2]])
+        table = Table.read(source, lines, at, columns)
+        if len(table.values) != n_entries:
+            raise source.fault(f"{len(table.values)} {entries}", f"{n_entries}, the second number of line {at}")
+        rest = header[match.end(2) :].partition("#")[0].strip()
+        remarks = [f"Line {at}: {quoted(rest)} after the two numbers is not read."] if rest else []
+        return n, table, [*remarks, *unread(lines)]
 
     @staticmethod
     def read(source: Source, lines: list[str], first: int, columns: tuple[int, ...]) -> "Table":
@@ -91,15 +72,11 @@ class Table:
         table = Table(source, lines, first, values, width)
         table.check(np.full(len(values), values.shape[1] == width), f"{width} numbers")
         table.check(np.isfinite(values).min(1), "finite numbers")
-        full = np.insert(values, 2, 1.0, axis=1) if width == 2 else values
-        return Table(source, lines, first, full, width)
-
-    @staticmethod
-    def column(source: Source, lines: list[str], first: int) -> "Table":
-        """The rows of a table of one number a line, which stands in the third place."""
-        table = Table.read(source, lines, first, (1,))
-        full = np.insert(table.values[:, :1], [0, 0], 0.0, axis=1)
-        return Table(source, lines, first, full, 1)
+        if width == 1:
+            values = np.insert(values, [0, 0], 0.0, axis=1)
+        elif width == 2:
+            values = np.insert(values, 2, 1.0, axis=1)
+        return Table(source, lines, first, values, width)
 
     def check(self, good: NDArray[np.bool_], expected: str) -> None:
         """Raise at the first row that is not good."""
