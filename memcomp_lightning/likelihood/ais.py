@@ -41,7 +41,6 @@ class AisEstimate(NamedTuple):
     log_weights: Tensor
 
     def __str__(self) -> str:
-        """One line a replica."""
         n_chains = self.log_weights.shape[-1]
         columns = (column.reshape(-1).tolist() for column in self[:3])
         return "\n".join(
@@ -132,7 +131,7 @@ class Ais(_Annealing):
         start = torch.sigmoid(base).unsqueeze(-2).expand(*rbm.replicas, self.n_chains, rbm.n_visible)
         v = rng.bernoulli(start, generator=generator)
         log_w = _anneal(rbm, v, base, self._schedule(), self.k, generator, progress)
-        return _summary(rbm, base, log_w, 1)
+        return _summary(_log_z_of_base(rbm, base), log_w, 1)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -176,7 +175,7 @@ class ReverseAis(_Annealing):
         require(fits and v.shape[-2] >= 2, "shape of v", tuple(v.shape), allowed)
         base = _base(model, base)
         log_w = _anneal(model, v.to(model.b), base, self._schedule()[::-1], self.k, generator, progress)
-        return _summary(model, base, log_w, -1)
+        return _summary(_log_z_of_base(model, base), log_w, -1)
 
 
 @torch.no_grad()
@@ -222,14 +221,18 @@ def _draw(probability: Tensor, generator: Generator) -> Tensor:
     return rng.uniform(probability.shape, generator=generator, like=probability).lt_(probability)
 
 
-def _summary(model: RBM, base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
-    """Estimate from weights whose mean is (Z / Z_0)^sign, with Z_0 = 2^n_hidden prod_j (1 + exp(b_0j))."""
-    log_z_of_base = model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
+def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
+    """Estimate from weights whose mean is (Z / Z_0)^sign."""
     n = log_w.shape[-1]
     w = torch.exp(log_w - log_w.amax(-1, keepdim=True))
     log_mean = w.mean(-1).log() + log_w.amax(-1)
     error = w.std(-1) / (w.mean(-1) * n**0.5)
     return AisEstimate(log_z_of_base + sign * log_mean, error, w.sum(-1).square() / w.square().sum(-1), log_w)
+
+
+def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
+    """Log of Z_0 = 2^n_hidden prod_j (1 + exp(b_0j)), ``(*replicas,)`` float64."""
+    return model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
 
 
 def _base(model: EnergyModel, base: Tensor | None) -> Tensor:

@@ -86,8 +86,7 @@ def log_likelihood_bound(
     Args:
         model: The machine.
         v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
-        log_z: Log of the partition function, ``(*replicas,)``. One from AIS is too low on average, and the bound
-            then too high.
+        log_z: Log of the partition function. One from AIS is too low on average, and the bound then too high.
         max_iterations: Of the mean field, >= 1.
         tolerance: Of the mean field, > 0.
     """

@@ -27,7 +27,7 @@ _NUMBERS = 2**23
 
 @torch.no_grad()
 def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress: bool = False) -> PerReplica:
-    r"""Return log Z, by enumerating the smaller layer.
+    r"""Return log Z in float64, by enumerating the smaller layer.
 
     .. math:: Z = \sum_s exp(g.s) \prod_i (1 + exp(W s + c)_i)
 
@@ -36,12 +36,9 @@ def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress:
     is taken as such an RBM (``two_layers``); of any other all units outside the largest class are enumerated.
 
     Args:
-        model: The model, of any dtype; the sum is done in float64.
+        model: The model, of any dtype.
         max_units: Largest smaller layer, 1 to 32.
         progress: Log an estimate of the time and show a bar.
-
-    Returns:
-        ``(*replicas,)`` float64.
 
     Raises:
         SettingError: The smaller layer has more than ``max_units`` units, or a parameter is not finite.
@@ -58,16 +55,9 @@ def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress:
 
 @torch.no_grad()
 def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 25) -> Visible:
-    """Draw independent visible states from the model, by enumerating the smaller layer.
+    """Draw n >= 1 independent visible states a replica, by enumerating the smaller layer.
 
-    Args:
-        model: The RBM.
-        n: Number of samples a replica, >= 1.
-        generator: Random stream.
-        max_units: Largest smaller layer, 1 to 32.
-
-    Returns:
-        States in {0, 1}, in the model's dtype.
+    It may have up to ``max_units`` units, which is 1 to 32.
 
     Raises:
         SettingError: As :func:`log_partition_function`.
@@ -100,7 +90,7 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
 
 @torch.no_grad()
 def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
-    """Return log p(v) = -F(v) - log Z of each image.
+    """Return log p(v) = -F(v) - log Z of each image, in nats and float64.
 
     In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
     their largest class: up to 16 of them. For more, see :func:`log_likelihood_bound`.
@@ -108,19 +98,16 @@ def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState
     Args:
         model: The model.
         v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
-        log_z: Log of the partition function, exact or estimated, ``(*replicas,)``.
-
-    Returns:
-        ``(*replicas, n)`` float64, in nats.
+        log_z: Log of the partition function, exact or estimated.
 
     Raises:
         SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
-    rbm = _as_rbm(model)
-    if rbm is None:
+    parameters = _of_rbm(model)
+    if parameters is None:
         return log_hidden_sum(model, v, max_units=MOST_HIDDEN) - log_z.double().unsqueeze(-1)
-    weight, b, c = _double(rbm)
+    weight, b, c = parameters
 
     def minus_free_energy(rows: Tensor) -> Tensor:
         field = rows @ weight.mT + c.unsqueeze(-2)
@@ -131,7 +118,7 @@ def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState
 
 def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
     """:func:`log_likelihood`, or :func:`log_likelihood_bound` of a machine with more than 16 hidden units."""
-    if model.n_hidden > MOST_HIDDEN and _as_rbm(model) is None:
+    if model.n_hidden > MOST_HIDDEN and model.quadratic_form().pairs is not None:
         return log_likelihood_bound(model, v, log_z)
     return log_likelihood(model, v, log_z)
 
@@ -142,7 +129,7 @@ def kl_divergence(
     v: Images,
     log_z: PerReplica | None = None,
 ) -> PerReplica:
-    r"""Return the divergence of the model from the empirical distribution of the rows of v.
+    r"""Return the divergence of the model from the empirical distribution of the rows of v, in nats and float64.
 
     .. math:: KL(p_v || p) = \sum_x p_v(x) (log p_v(x) - log p(x))
 
@@ -153,17 +140,14 @@ def kl_divergence(
         v: Images in {0, 1}, as for :func:`log_likelihood`.
         log_z: Log of the partition function; None enumerates (:func:`log_partition_function`).
 
-    Returns:
-        ``(*replicas,)`` float64, in nats; >= 0 where log Z is exact.
-
     Raises:
         SettingError: v is not binary or has the wrong shape; the smaller layer is too large to enumerate.
     """
     require_count("number of rows of v", _binary(model, v).shape[-2])
     log_p = log_likelihood(model, v, log_partition_function(model) if log_z is None else log_z)
     n = v.shape[-2]
-    log_shares = [_log_shares(rows) for rows in v.reshape(-1, n, v.shape[-1])]
-    return (torch.stack(log_shares).reshape(*v.shape[:-2], n) - log_p).mean(-1)
+    log_shares = torch.stack([_log_shares(rows) for rows in v.reshape(-1, n, v.shape[-1])])
+    return (log_shares.reshape(*v.shape[:-2], n) - log_p).mean(-1)
 
 
 def _log_shares(rows: Tensor) -> Tensor:
@@ -175,26 +159,20 @@ def _log_shares(rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
-    r"""Return log p(v_j | all other v) of each unit j of each image; needs no log Z.
+    r"""Return log p(v_j | all other v) of each unit j of each image in float64; needs no log Z.
 
     .. math:: log p(v_j | v_{-j}) = -softplus(F(v) - F(v'))
 
     where v' is v with unit j flipped. (Besag 1975.) In an RBM its hidden field differs from that of v by one
     column of W; in a Boltzmann machine the hidden units, up to 16 outside their largest class, are enumerated.
-
-    Args:
-        model: The model.
-        v: Images in {0, 1}, as for :func:`log_likelihood`.
-
-    Returns:
-        ``(*replicas, n, n_visible)`` float64; the sum over the last axis is the log pseudo-likelihood of an image.
+    The images are those of :func:`log_likelihood`; the log pseudo-likelihood of one is the sum over the last axis.
 
     Raises:
         SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
     """
     v = _binary(model, v)
-    rbm = _as_rbm(model)
-    if rbm is None:
+    parameters = _of_rbm(model)
+    if parameters is None:
         flips = torch.eye(model.n_visible, dtype=torch.float64, device=v.device)
 
         def of_images(rows: Tensor) -> Tensor:
@@ -204,7 +182,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
             return -softplus(log_sums.unflatten(-1, flipped.shape[-3:-1]) - log_sum)
 
         return _in_chunks(of_images, v, model.n_visible * model.n_units)
-    weight, b, c = _double(rbm)
+    weight, b, c = parameters
 
     def of_rows(rows: Tensor) -> Tensor:
         field = rows @ weight.mT + c.unsqueeze(-2)
@@ -223,23 +201,17 @@ def _binary(model: EnergyModel, v: Tensor) -> Tensor:
     allowed = f"(n, {model.n_visible}), or with the replica axes {replicas} in front of it"
     require(fits, "shape of v", tuple(v.shape), allowed)
     other = v[(v != 0) & (v != 1)]
-    require(
-        not len(other),
-        "v",
-        float(other[0]) if len(other) else 0.0,
-        "values in {0, 1}",
-        "Grey values have no likelihood under a Bernoulli RBM: binarise the images, say v > 0.5.",
-    )
+    remedy = "Grey values have no likelihood under a Bernoulli RBM: binarise the images, say v > 0.5."
+    require(not len(other), "v", float(other[0]) if len(other) else 0.0, "values in {0, 1}", remedy)
     return v.expand(*replicas, *v.shape[-2:])
 
 
-def _as_rbm(model: EnergyModel) -> RBM | None:
-    """The model if its two classes are the visible and the hidden units: sums over h have a closed form then."""
-    return as_two_layers(model).rbm if model.quadratic_form().pairs is None else None
-
-
-def _double(model: RBM) -> tuple[Tensor, Tensor, Tensor]:
-    return model.weight.double(), model.b.double(), model.c.double()
+def _of_rbm(model: EnergyModel) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Weights and both biases in float64, if the model is an RBM: sums over h have a closed form then."""
+    if model.quadratic_form().pairs is not None:
+        return None
+    rbm = as_two_layers(model).rbm
+    return rbm.weight.double(), rbm.b.double(), rbm.c.double()
 
 
 def _in_chunks(function: Callable[[Tensor], Tensor], v: Tensor, numbers_a_row: int) -> Tensor:

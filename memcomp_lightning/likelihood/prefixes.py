@@ -43,15 +43,14 @@ def prefix_log_weights(
 ) -> Float[Tensor, "replicas prefixes"]:
     """Log of the summed weights of all states with the same prefix; their logsumexp is log Z.
 
+    It is float64 on the model's device, of ``2^(n_enumerated - n_second)`` prefixes.
+
     Args:
         layers: The model.
         n_second: Units of u; None is ``N_SECOND`` or all.
         block: Prefixes at a time; None is what fits the memory.
         compiled: Use the kernel; None is where the model lies on the CPU.
         progress: Log an estimate of the time and show a bar.
-
-    Returns:
-        ``(n_replicas, 2^(n_enumerated - n_second))`` float64 on the model's device.
     """
     n_second = min(N_SECOND, layers.n_enumerated) if n_second is None else n_second
     cpu = _cpu() if compiled or (compiled is None and layers.weight.device.type == "cpu") else None

@@ -55,34 +55,23 @@ def grid(n_rows: int, n_columns: int) -> Pairs:
 
 
 def from_graph(graph: Any) -> Pairs:
-    """Edges of a networkx graph, nodes numbered in ascending order: ``dwave.graphs.zephyr_graph(2)``, say.
-
-    Args:
-        graph: Anything with ``nodes`` and ``edges``; the nodes can be sorted.
-    """
+    """Edges of a networkx graph, its nodes numbered in ascending order: ``dwave.graphs.zephyr_graph(2)``, say."""
     number = {node: index for index, node in enumerate(sorted(graph.nodes))}
     edges = [(number[first], number[second]) for first, second in graph.edges]
     return from_pairs(len(number), torch.tensor(edges, dtype=torch.long, device="cpu").view(-1, 2))
 
 
 def from_mask(mask: Tensor) -> Pairs:
-    """The pairs of a symmetric matrix.
-
-    Args:
-        mask: ``(n, n)``: True, or other than zero, where two units are coupled.
+    """The pairs of a symmetric matrix ``(n, n)``, True or other than zero where two units are coupled.
 
     Raises:
         SettingError: It is not square, not symmetric, or couples a unit to itself.
     """
     require(mask.ndim == 2 and mask.shape[0] == mask.shape[1], "shape of the mask", tuple(mask.shape), "(n, n)")
     mask = mask != 0
-    require(
-        bool(mask.equal(mask.mT)),
-        "mask",
-        f"asymmetric at {(mask ^ mask.mT).nonzero()[:1].tolist()}",
-        "a symmetric matrix: a coupling has no direction",
-        "Use mask | mask.T.",
-    )
+    one_way = (mask ^ mask.mT).nonzero()[:1].tolist()
+    allowed = "a symmetric matrix: a coupling has no direction"
+    require(not one_way, "mask", f"asymmetric at {one_way}", allowed, "Use mask | mask.T.")
     itself = mask.diagonal().nonzero()[:1].flatten().tolist()
     require(not itself, "mask", f"unit {itself} coupled to itself", "a diagonal of zeros; what is there is a bias")
     return mask.triu().nonzero()

@@ -110,7 +110,7 @@ class BatchNormReluNetwork(nn.Module):
         n_classes: Number of outputs, >= 2.
         replicas: Leading axes of independent networks.
         weight_init: Draws all weights.
-        generator: Random stream of the weights; None is a fresh stream of seed 0.
+        generator: As that of :class:`Linear`.
     """
 
     def __init__(

@@ -77,11 +77,7 @@ def mean_log_odds(v: Images) -> Float[Tensor, "*axes n_visible"]:
 def start_at_means(model: EnergyModel, v: Images) -> None:
     """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
 
-    Hinton 2012, A Practical Guide to Training RBMs, section 8.1.
-
-    Args:
-        model: An RBM or a Boltzmann machine.
-        v: Training data, ``(*replicas, n, n_visible)``, or without replica axes for the same data everywhere.
+    Hinton 2012, A Practical Guide to Training RBMs, section 8.1. The data may be without the model's replica axes.
     """
     model.b.copy_(mean_log_odds(v).expand(model.b.shape))
 

@@ -15,9 +15,7 @@ ModuleT = TypeVar("ModuleT", bound=nn.Module)
 def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     """Return a copy of all ``networks`` as one, with their replicas one after the other on a single axis.
 
-    Args:
-        networks: Of one architecture.
-        replicas: Leading axes of each of them.
+    ``replicas`` are the leading axes of each of them.
 
     Raises:
         SettingError: There is none, or names, shapes or numbers of axes differ.
@@ -34,9 +32,8 @@ def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     parameters = dict(whole.named_parameters())
     for name, tensor in states[0].items():
         if not tensor.is_floating_point():  # indices of units, the same in all replicas
-            require(
-                all(tensor.equal(state[name]) for state in states), name, "different", "the same in all networks"
-            )
+            alike = all(tensor.equal(state[name]) for state in states)
+            require(alike, name, "different", "the same in all networks")
             continue
         own_axes = tensor.shape[len(replicas) :]
         together = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)

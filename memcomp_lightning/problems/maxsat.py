@@ -81,30 +81,20 @@ class WeightedMaxSat:
 
     def alike(self, like: AnyArray) -> "WeightedMaxSat":
         """The same problem in the library and on the device of ``like``: a tensor, as to solve it on a GPU."""
+        names = ("weight", "first", "second", "unit", "offset")
+        parts = {name: alike(getattr(self, name), like) for name in names}
         longer = (
-            Clauses(alike(block.variables, like), alike(block.polarity, like), alike(block.weight, like))
+            Clauses(*(alike(part, like) for part in (block.variables, block.polarity, block.weight)))
             for block in self.longer
         )
-        return WeightedMaxSat(
-            graph=self.graph.alike(like),
-            weight=alike(self.weight, like),
-            first=alike(self.first, like),
-            second=alike(self.second, like),
-            unit=alike(self.unit, like),
-            offset=alike(self.offset, like),
-            longer=tuple(longer),
-        )
+        return WeightedMaxSat(graph=self.graph.alike(like), **parts, longer=tuple(longer))
 
     def energy(self, x: Array) -> Array:
         """Unsatisfied weight + offset in float64, ``(*problems, n_states)``, of ``x (*problems, n_states, n)``."""
         return self.unsatisfied_weight(x) + double(self.offset)[..., None]
 
     def unsatisfied_weight(self, x: Array) -> Array:
-        """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, by its definition.
-
-        Args:
-            x: States ``(*problems, n_states, n)`` in {0, 1}.
-        """
+        """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, of states in {0, 1}."""
         x, n_axes = alike(x, self.unit), len(self.graph.edge_shape)
         false = [
             (1 - (2 * value - 1) * over_states(polarity, n_axes)) / 2

@@ -29,22 +29,13 @@ class Qubo:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "graph", self.graph.alike(self.linear))
-        edge_shape, n = self.graph.edge_shape, self.graph.n
-        axes = len(edge_shape)
-        require(
-            tuple(self.coupling.shape[self.coupling.ndim - axes :]) == edge_shape,
-            "coupling shape",
-            tuple(self.coupling.shape),
-            f"(*problems, {', '.join(map(str, edge_shape))})",
-        )
-        problems = tuple(self.coupling.shape[: self.coupling.ndim - axes])
-        require(
-            tuple(self.linear.shape) == (*problems, n),
-            "linear shape",
-            tuple(self.linear.shape),
-            f"{(*problems, n)}",
-        )
-        require(tuple(self.offset.shape) == problems, "offset shape", tuple(self.offset.shape), f"{problems}")
+        coupling, linear, offset = (tuple(part.shape) for part in (self.coupling, self.linear, self.offset))
+        edge_shape, axes = self.graph.edge_shape, len(coupling) - len(self.graph.edge_shape)
+        allowed = f"(*problems, {', '.join(map(str, edge_shape))})"
+        require(coupling[axes:] == edge_shape, "coupling shape", coupling, allowed)
+        problems = coupling[:axes]
+        require(linear == (*problems, self.n), "linear shape", linear, f"{(*problems, self.n)}")
+        require(offset == problems, "offset shape", offset, f"{problems}")
         isfinite = namespace(self.linear).isfinite
         for name, numbers in (("coupling", self.coupling), ("linear", self.linear), ("offset", self.offset)):
             require(bool(isfinite(numbers).all()), name, "an array with NaN or infinite entries", "finite numbers")
@@ -109,12 +100,8 @@ class Qubo:
         [-1.0]
         """
         n, matrix = matrix.shape[-1], as_array(matrix)
-        require(
-            matrix.ndim >= 2 and matrix.shape[-2] == n,
-            "matrix shape",
-            tuple(matrix.shape),
-            "(*problems, n, n)",
-        )
+        square = matrix.ndim >= 2 and matrix.shape[-2] == n
+        require(square, "matrix shape", tuple(matrix.shape), "(*problems, n, n)")
         if hasattr(matrix, "tocoo"):
             coo = matrix.tocoo()
             rows, columns = (index.astype("int64") for index in (coo.row, coo.col))
@@ -147,13 +134,10 @@ class Qubo:
         """
         rows, columns, values = as_array(rows), as_array(columns), as_array(values)
         for name, index in (("rows", rows), ("columns", columns)):
-            require(
-                index.shape == values.shape[-1:] and bool(((index >= 0) & (index < n)).all()),
-                name,
-                f"shape {tuple(index.shape)}, from {index.min() if len(index) else '-'} "
-                f"to {index.max() if len(index) else '-'}",
-                f"{values.shape[-1]} integers, one a value, from 0 to n - 1 = {n - 1}",
-            )
+            fits = index.shape == values.shape[-1:] and bool(((index >= 0) & (index < n)).all())
+            least, most = (index.min(), index.max()) if len(index) else ("-", "-")
+            allowed = f"{values.shape[-1]} integers, one a value, from 0 to n - 1 = {n - 1}"
+            require(fits, name, f"shape {tuple(index.shape)}, from {least} to {most}", allowed)
         xp, diagonal = namespace(values), rows == columns
         first, second = xp.minimum(rows, columns)[~diagonal], xp.maximum(rows, columns)[~diagonal]
         keys, position = xp.unique_inverse(first * n + second)

@@ -58,11 +58,7 @@ class Answer:
 
     @staticmethod
     def of(problem: Problem, solution: QuboSolution) -> "Answer":
-        """What a solver found, in the terms of the problem's file.
-
-        Args:
-            problem: A problem from a file.
-            solution: Of ``problem.problem``, or of ``problem.integers``.
+        """What a solver found of ``problem.problem`` or ``problem.integers``, in the terms of the problem's file.
 
         Raises:
             SettingError: The solution is of more than one problem.
@@ -70,39 +66,27 @@ class Answer:
         require(solution.energies.ndim == 1, "energies' shape", tuple(solution.energies.shape), "(n_restarts,)")
         # Solvers return the dtype of what they were given: integers were compared as integers.
         exact = problem.resolved or solution.assignments.dtype == namespace(solution.assignments).int64
-        scores: list[Score | None] = []
-        status: list[Status] = []
-        for x, energy, code in zip(
-            solution.assignments, solution.energies.tolist(), solution.status.tolist(), strict=True
-        ):
-            score = problem.score(x) if math.isfinite(energy) else None
-            scores.append(score)
-            proven = code == Status.OPTIMAL and score is not None
-            if proven and score is not None and score.hard_unsatisfied and exact:
-                code = Status.INFEASIBLE
-            elif proven and not exact:
-                code = Status.ROUNDED
-            status.append(Status(code))
-        energies = [None if score is None else problem.objective.energy(score) for score in scores]
-        ran = [k for k, energy in enumerate(energies) if energy is not None]
-        best = min(ran, key=lambda k: energies[k])  # type: ignore[return-value, arg-type]
-        chosen = scores[best]
-        assert chosen is not None
-        assignment = problem.expand(solution.assignments[best] > 0.5)
-        return Answer(assignment, chosen, problem.objective.energy(chosen), energies, status)
+        status = [Status(code) for code in solution.status.tolist()]
+        energies: list[Exact | float | None] = [None] * len(status)
+        found: list[tuple[Exact | float, int, Score]] = []
+        for k, rounded in enumerate(solution.energies.tolist()):
+            if not math.isfinite(rounded):
+                continue
+            score = problem.score(solution.assignments[k])
+            energies[k] = energy = problem.objective.energy(score)
+            found.append((energy, k, score))
+            if status[k] is Status.OPTIMAL and not exact:
+                status[k] = Status.ROUNDED
+            elif status[k] is Status.OPTIMAL and score.hard_unsatisfied:
+                status[k] = Status.INFEASIBLE
+        energy, best, score = min(found)
+        return Answer(problem.expand(solution.assignments[best] > 0.5), score, energy, energies, status)
 
 
 def write_solution(
     path: Path, problem: Problem, solution: QuboSolution, *, solver: Mapping[str, Any], seed: int
 ) -> None:
-    """Write a solver's answer as JSON, whole or not at all.
-
-    Args:
-        path: Where to.
-        problem: What was solved: one problem.
-        solution: The answer to it.
-        solver: Settings of the solver, as JSON can hold them.
-        seed: The seed of its random stream.
+    """Write the answer to one problem as JSON, whole or not at all, with the solver's settings and its seed.
 
     Raises:
         SettingError: The answer is to more than one problem.

@@ -85,14 +85,10 @@ def problem_at(qubo: Qubo, index: int) -> Qubo:
 
 def check_parameters(sampler: Any, parameters: Mapping[str, Any]) -> None:
     """Refuse what is no sampler of dimod, and parameters that it does not take."""
-    require(
-        hasattr(sampler, "sample") and hasattr(sampler, "parameters"),
-        "sampler",
-        type(sampler).__name__,
-        "a dimod.Sampler",
-    )
+    kind = type(sampler).__name__
+    require(hasattr(sampler, "sample") and hasattr(sampler, "parameters"), "sampler", kind, "a dimod.Sampler")
     for name in parameters:
         known = sorted(sampler.parameters)
-        require(name in known, f"parameter of {type(sampler).__name__}", name, f"one of {', '.join(known)}")
+        require(name in known, f"parameter of {kind}", name, f"one of {', '.join(known)}")
     if "num_reads" in parameters:
         require_count("num_reads", parameters["num_reads"])

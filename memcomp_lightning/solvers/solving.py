@@ -80,9 +80,8 @@ def _too_large(problem: Problem, solver: QuboSolver) -> str:
     restarts = getattr(solver, "n_restarts", None)
     each = "" if restarts is None else f" with solver.n_restarts = {restarts}"
     remedy = "a smaller problem" if restarts in (None, 1) else "fewer restarts, as solver.n_restarts=1"
-    needed, installed = (
-        f"{n_bytes / 2**30:.0f} GiB" for n_bytes in (memory_needed(problem.problem, solver), _installed())
-    )
+    sizes_in_bytes = memory_needed(problem.problem, solver), _installed()
+    needed, installed = (f"{n_bytes / 2**30:.0f} GiB" for n_bytes in sizes_in_bytes)
     return (
         f"{problem.path}: {sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
         f"more than there is ({installed}): try {remedy}."

@@ -12,10 +12,7 @@ SMALLEST_RATIO = 1e-12
 def by_largest(coupling: Array, linear: Array, n_axes: int) -> tuple[Array, Array]:
     """Divide by the largest entry: squares of 1e-30 or 1e30 would leave the range of float32.
 
-    Args:
-        coupling: ``(*problems, *edge_shape)``, ``n_axes`` of them edge axes.
-        linear: ``(*problems, n)``.
-        n_axes: Number of edge axes.
+    ``n_axes`` is the number of edge axes of the couplings.
     """
     xp = namespace(linear)
     largest = xp.maximum(amax(abs(coupling), n_axes), xp.max(abs(linear), axis=-1))
@@ -49,11 +46,8 @@ def effective_degree(size: Array, power: Array) -> Array:
     r"""Number of couplings that matter to a variable, which bounds the long-term memories, ``(*problems,)``.
 
     Mean over the coupled variables of ``(\sum_j |w_ij|)^2 / \sum_j w_ij^2``: the number of couplings of a variable
-    if all are alike, less if some are stronger. At least 1.
-
-    Args:
-        size: ``\sum_j |w_ij|`` of each variable, ``(*problems, n)``.
-        power: ``\sum_j w_ij^2``, likewise.
+    if all are alike, less if some are stronger. At least 1. The two sums of each variable, ``(*problems, n)``, are
+    ``size`` and ``power``.
     """
     where = namespace(power).where
     return mean_of_used(where(power > 0, size * size / where(power > 0, power, 1), 0)).clip(min=1)
@@ -66,12 +60,8 @@ DEGREE_EXPONENT = 0.17
 def step_scale(n: int, n_coupled: Array) -> Array:
     r"""Factor on a step that suits 200 variables: larger problems want smaller steps (measured), ``(*problems,)``.
 
-    It is ``(n_c / 200)^{-0.3} \sqrt{n_c / n}``. The root corrects for variables without couplings, which count in
-    the root mean square of the rates, too.
-
-    Args:
-        n: Number of variables.
-        n_coupled: Number n_c of those that are coupled, ``(*problems,)``.
+    It is ``(n_c / 200)^{-0.3} \sqrt{n_c / n}`` for n variables, n_c of which are coupled. The root corrects for
+    those without couplings, which count in the root mean square of the rates, too.
     """
     count = double(n_coupled.clip(min=1))
     return (count / 200) ** -SIZE_EXPONENT * (count / n) ** 0.5
@@ -89,10 +79,6 @@ def collective_mode(graph: Graph, coupling: Array) -> Array:
     that suit independent couplings would let all variables flip back and forth together: the critical step falls
     with 1 / lambda. Found by power iteration from a fixed start, which is
     orthogonal to no pattern that problems are likely to have.
-
-    Args:
-        graph: The pairs.
-        coupling: ``(*problems, *edge_shape)``, divided by their :func:`coupling_norm`.
     """
     xp, problems = namespace(coupling), coupling.shape[: coupling.ndim - len(graph.edge_shape)]
     n = xp.arange(graph.n, device=coupling.device, dtype=coupling.dtype)
