@@ -1,5 +1,6 @@
 """The Boltzmann machine: visible and hidden units with any symmetric connectivity."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -171,12 +172,15 @@ class BoltzmannMachine(Machine):
         """The classes, each with its couplings: what a sweep over all units needs."""
         bias, found = self.bias, []
         for units, neighbours, edge, slot, _ in self._layouts():
-            flat = self.coupling.new_zeros(*self.replicas, len(units) * len(neighbours))
-            weight = flat.index_copy(-1, slot, self.coupling[..., edge])
-            found.append(
-                Block(units, neighbours, weight.unflatten(-1, (len(units), len(neighbours))), bias[..., units])
-            )
+            weight = self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
+            found.append(Block(units, neighbours, weight, bias[..., units]))
         return found
+
+    def _placed(self, shape: tuple[int, int], at: Tensor, coupling: Tensor) -> Tensor:
+        """Couplings at these places of a flat matrix of zeros, as a matrix."""
+        flat = self.coupling.new_zeros(*self.replicas, math.prod(shape))
+        placed: Tensor = flat.index_copy(-1, at, coupling).unflatten(-1, shape)
+        return placed
 
     def chains(self) -> ClassChains:
         """Gibbs chains of all units, at the present parameters."""
@@ -218,10 +222,8 @@ class BoltzmannMachine(Machine):
         """Couplings of hidden to visible units, zero where there are none, as a copy."""
         n, (first, second) = self.n_visible, self.pairs.unbind(-1)
         across = (first < n) & (second >= n)
-        flat = self.coupling.new_zeros(*self.replicas, self.n_hidden * n)
         at = (second[across] - n) * n + first[across]
-        weight: Tensor = flat.index_copy(-1, at, self.coupling[..., across]).unflatten(-1, (self.n_hidden, n))
-        return weight
+        return self._placed((self.n_hidden, n), at, self.coupling[..., across])
 
     def energy(self, v: Visible, h: Hidden) -> PerState:
         """E(v, h) of each configuration."""

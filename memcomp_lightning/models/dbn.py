@@ -49,7 +49,6 @@ class DBN(nn.Module):
         )
 
     def __len__(self) -> int:
-        """Number of layers."""
         return len(self.rbms)
 
     def __getitem__(self, layer: int) -> RBM:
@@ -57,7 +56,6 @@ class DBN(nn.Module):
         return cast(RBM, self.rbms[layer])
 
     def __iter__(self) -> Iterator[RBM]:
-        """The RBMs from the lowest up."""
         return (self[layer] for layer in range(len(self)))
 
     @property

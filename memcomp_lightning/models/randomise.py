@@ -38,11 +38,8 @@ class GaussianMoments:
     def __call__(self, dbn: DBN, *, generator: Generator) -> None:
         """Change each layer of each replica on its own."""
         for values in _vectors(dbn):
-            draw = (
-                torch.empty(values.shape, dtype=values.dtype, device=generator.device)
-                .normal_(generator=generator)
-                .to(values.device)
-            )
+            empty = torch.empty(values.shape, dtype=values.dtype, device=generator.device)
+            draw = empty.normal_(generator=generator).to(values.device)
             values.copy_(values.mean(-1, keepdim=True) + values.std(-1, correction=0, keepdim=True) * draw)
 
 

@@ -1,10 +1,9 @@
 """What every solver of a QUBO takes and gives back, and how each restart ended."""
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
-
-import numpy as np
 
 from memcomp_lightning.arrays import Array, namespace, to_numpy
 from memcomp_lightning.problems.qubo import Qubo
@@ -14,33 +13,24 @@ if TYPE_CHECKING:
 
 
 class Status(IntEnum):
-    """How one restart of a solver ended; ``advice`` says what to do about it."""
+    """How one restart of a solver ended; ``advice`` says what to do about it, one sentence for a person."""
 
-    OPTIMAL = 0
-    CONVERGED = 1
-    STEP_BUDGET = 2
-    STILL_IMPROVING = 3
-    NOT_RUN = 4
-    STALLED = 5
-    INFEASIBLE = 6
-    ROUNDED = 7
+    advice: str
 
-    @property
-    def advice(self) -> str:
-        """One sentence for a person."""
-        return _ADVICE[self]
+    def __new__(cls, value: int, advice: str = "") -> "Status":
+        """A number with its advice."""
+        status = int.__new__(cls, value)
+        status._value_, status.advice = value, advice
+        return status
 
-
-_ADVICE = {
-    Status.OPTIMAL: "Proven: no state has a lower energy.",
-    Status.CONVERGED: "No block of variables improves this assignment; more restarts may find a lower one.",
-    Status.STEP_BUDGET: "The best assignment came long before the last step; more restarts may find a lower one.",
-    Status.STILL_IMPROVING: "The best assignment came in the last tenth of the steps: raise max_steps.",
-    Status.STALLED: "Nothing better for far longer than the best one took; more restarts may find a lower one.",
-    Status.INFEASIBLE: "Every state was examined: none satisfies all hard clauses; this one breaks the fewest.",
-    Status.ROUNDED: "The search was complete, but float64 rounds sums of these numbers: another may be lower.",
-    Status.NOT_RUN: "Not run: enough restarts before it had found nothing better.",
-}
+    OPTIMAL = 0, "Proven: no state has a lower energy."
+    CONVERGED = 1, "No block of variables improves this assignment; more restarts may find a lower one."
+    STEP_BUDGET = 2, "The best assignment came long before the last step; more restarts may find a lower one."
+    STILL_IMPROVING = 3, "The best assignment came in the last tenth of the steps: raise max_steps."
+    NOT_RUN = 4, "Not run: enough restarts before it had found nothing better."
+    STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
+    INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
+    ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
 
 
 class RecordedStates(Protocol):
@@ -88,11 +78,8 @@ class QuboSolution:
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""
-        values, counts = np.unique(to_numpy(self.status), return_counts=True)
-        return {
-            f"{Status(int(value)).name}: {Status(int(value)).advice}": int(count)
-            for value, count in zip(values, counts, strict=True)
-        }
+        counts = Counter(Status(value) for value in to_numpy(self.status).ravel().tolist())
+        return {f"{status.name}: {status.advice}": counts[status] for status in sorted(counts)}
 
 
 class QuboSolver(Protocol):

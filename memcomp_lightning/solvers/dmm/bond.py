@@ -97,12 +97,8 @@ class BondField:
         for name in ("kappa", "noise"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a number >= 0")
         require(0 < self.short_term_min < 1, "short_term_min", self.short_term_min, "a number in (0, 1)")
-        require(
-            self.short_term_min <= self.short_term_start <= 1,
-            "short_term_start",
-            self.short_term_start,
-            f"a number in [short_term_min = {self.short_term_min}, 1]",
-        )
+        start, allowed = self.short_term_start, f"a number in [short_term_min = {self.short_term_min}, 1]"
+        require(self.short_term_min <= start <= 1, "short_term_start", start, allowed)
         require(self.long_term_max >= 1, "long_term_max", self.long_term_max, "a number >= 1")
         require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
 

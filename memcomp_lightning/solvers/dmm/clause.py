@@ -6,7 +6,7 @@ two-literal form follows public research code of the same group. Constants: docs
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from memcomp_lightning.arrays import Array, add_up, cast, multiply_add, namespace
 from memcomp_lightning.errors import require
@@ -114,8 +114,8 @@ class ClauseField:
         require(self.long_term_max >= 1, "long_term_max", self.long_term_max, "a number >= 1")
         require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
 
-    def most_long_term(self, degree: Any) -> Any:
-        """Upper bound of the long-term memories at an effective degree, an array."""
+    def most_long_term(self, degree: Array) -> Array:
+        """Upper bound of the long-term memories at an effective degree."""
         return 1 + (self.long_term_max - 1) * degree**-DEGREE_EXPONENT
 
     def build(self, problem: Qubo | WeightedMaxSat) -> ClauseMachine:
