@@ -107,12 +107,7 @@ class Ais(_Annealing):
         _Annealing.__post_init__(self)
 
     def estimate(
-        self,
-        model: EnergyModel,
-        *,
-        generator: Generator,
-        base: Tensor | None = None,
-        progress: bool = False,
+        self, model: EnergyModel, *, generator: Generator, base: Tensor | None = None, progress: bool = False
     ) -> AisEstimate:
         """Estimate log Z.
 
@@ -141,22 +136,11 @@ class ReverseAis(_Annealing):
     The mean weight is Z_0 / Z without bias; log Z is therefore too high on average. With ``Ais`` it brackets log Z
     (Burda et al. 2015; Grosse et al. 2015) - but only if the samples are the model's own: exact ones
     (``exact_samples``), where the smaller layer can be enumerated. From Markov chains, which never mix to the end,
-    the estimate is no bound any more.
-
-    Attributes:
-        n_betas: Steps of the linear schedule, >= 1.
-        betas: The schedule itself, as that of ``Ais``, increasing from 0 to 1; None is linear.
-        k: Gibbs sweeps at each beta, >= 1.
+    the estimate is no bound any more. ``n_betas``, ``betas`` and ``k`` are as those of ``Ais``.
     """
 
     def estimate(
-        self,
-        model: RBM,
-        v: Visible,
-        *,
-        generator: Generator,
-        base: Tensor | None = None,
-        progress: bool = False,
+        self, model: RBM, v: Visible, *, generator: Generator, base: Tensor | None = None, progress: bool = False
     ) -> AisEstimate:
         """Estimate log Z; ``log_weights`` are those of Z_0 / Z.
 
@@ -180,13 +164,7 @@ class ReverseAis(_Annealing):
 
 @torch.no_grad()
 def _anneal(
-    model: RBM,
-    v: Tensor,
-    base: Tensor,
-    betas: Sequence[float],
-    k: int,
-    generator: Generator,
-    progress: bool,
+    model: RBM, v: Tensor, base: Tensor, betas: Sequence[float], k: int, generator: Generator, progress: bool
 ) -> Tensor:
     """Log weights of chains that start at v, in equilibrium at the first beta, ``(*replicas, n_chains)``."""
     log_w = torch.zeros(v.shape[:-1], dtype=torch.float64, device=v.device)

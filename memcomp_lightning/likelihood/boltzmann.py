@@ -8,12 +8,9 @@ from torch import Tensor
 
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.likelihood.layers import softplus
+from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks, softplus
 from memcomp_lightning.models.base import Block, EnergyModel, Images, PerReplica, PerState
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
-
-_NUMBERS = 2**23
-"""float64 numbers held at a time."""
 
 
 def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
@@ -32,7 +29,7 @@ def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Per
     largest = max(blocks, key=lambda block: len(block.units))
     others = _without(torch.arange(model.n_units, device=model.b.device), largest.units)
     _require_few(len(others), max_units)
-    rows = max(1, _NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
+    rows = max(1, NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
     parts = []
     for start in range(0, 2 ** len(others), rows):
         states = binary_states(
@@ -56,39 +53,28 @@ def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> PerState:
     others = _without(hidden, largest.units)
     _require_few(len(others), max_units)
     states = binary_states(len(others), like=v)
-    rows = max(1, _NUMBERS // (len(states) * model.n_units * max(1, math.prod(model.replicas))))
-    parts = []
-    for some in v.split(rows, dim=-2):
+
+    def of_images(some: Tensor) -> Tensor:
         x = some.new_zeros(*some.shape[:-1], len(states), model.n_units)
         x[..., : model.n_visible] = some.unsqueeze(-2)
         x[..., others] = states
-        log_sums = _summed_over(model, largest, x.flatten(-3, -2)).unflatten(-1, x.shape[-3:-1])
-        parts.append(log_sums.logsumexp(-1))
-    return torch.cat(parts, dim=-1)
+        log_sums: Tensor = _summed_over(model, largest, x.flatten(-3, -2)).unflatten(-1, x.shape[-3:-1])
+        return log_sums.logsumexp(-1)
+
+    return in_chunks(of_images, v, len(states) * model.n_units)
 
 
 @torch.no_grad()
 def log_likelihood_bound(
-    model: EnergyModel,
-    v: Images,
-    log_z: PerReplica,
-    *,
-    max_iterations: int = 100,
-    tolerance: float = 1e-4,
+    model: EnergyModel, v: Images, log_z: PerReplica, *, max_iterations: int = 100, tolerance: float = 1e-4
 ) -> PerState:
     r"""Return the mean-field lower bound of log p(v).
 
     .. math:: \log p(v) \ge -E(v, \mu) + \sum_i H(\mu_i) - \log Z
 
     with the means :math:`\mu` of :func:`memcomp_lightning.models.mean_field` and their entropies H
-    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled.
-
-    Args:
-        model: The machine.
-        v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
-        log_z: Log of the partition function. One from AIS is too low on average, and the bound then too high.
-        max_iterations: Of the mean field, >= 1.
-        tolerance: Of the mean field, > 0.
+    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled. The images are in {0, 1}
+    and may be without replica axes. A log Z from AIS is too low on average, and the bound then too high.
     """
     require_count("max_iterations", max_iterations)
     model = _double(model)
@@ -115,10 +101,6 @@ def _without(units: Tensor, some: Tensor) -> Tensor:
 
 
 def _require_few(n_units: int, max_units: int) -> None:
-    require(
-        n_units <= max_units,
-        "units outside the largest class",
-        n_units,
-        f"at most max_units = {max_units}, because all their states are enumerated",
-        "Use Ais if the machine has two classes of units; otherwise use a smaller machine.",
-    )
+    allowed = f"at most max_units = {max_units}, because all their states are enumerated"
+    remedy = "Use Ais if the machine has two classes of units; otherwise use a smaller machine."
+    require(n_units <= max_units, "units outside the largest class", n_units, allowed, remedy)

@@ -1,7 +1,5 @@
 """Exact likelihoods of models small enough to be enumerated, and pseudo-likelihoods, which need no log Z."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Generator, Tensor
 
@@ -13,16 +11,13 @@ from memcomp_lightning.likelihood.boltzmann import (
     log_likelihood_bound,
     log_partition_function_by_classes,
 )
-from memcomp_lightning.likelihood.layers import enumerable, log_weights, softplus
+from memcomp_lightning.likelihood.layers import NUMBERS, enumerable, in_chunks, log_weights, softplus
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
 from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible, as_two_layers
 from memcomp_lightning.models.rbm import RBM
 
 MOST_HIDDEN = 16
 """Hidden units of a Boltzmann machine that are enumerated for each image at most."""
-
-_NUMBERS = 2**23
-"""float64 numbers held at a time."""
 
 
 @torch.no_grad()
@@ -65,10 +60,9 @@ def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 
     require_count("n", n)
     layers = enumerable(model, max_units)
     n_second = min(N_SECOND, layers.n_enumerated)
-    of_prefixes = prefix_log_weights(layers, n_second=n_second).unsqueeze(-2)
-    prefix = _draw(of_prefixes.expand(-1, 1, -1), n, generator=generator).squeeze(-2)
+    prefix = _draw(prefix_log_weights(layers, n_second=n_second), n, generator=generator)
     second = binary_states(n_second, like=layers.weight)
-    rows = max(1, _NUMBERS // (len(layers.weight) * layers.n_other * len(second)))
+    rows = max(1, NUMBERS // (len(layers.weight) * layers.n_other * len(second)))
     rest = []
     for part in prefix.split(rows, dim=-1):
         log_weight = log_weights(layers, bits(part, layers.n_enumerated - n_second, like=second), second)
@@ -95,10 +89,8 @@ def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState
     In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
     their largest class: up to 16 of them. For more, see :func:`log_likelihood_bound`.
 
-    Args:
-        model: The model.
-        v: Images in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
-        log_z: Log of the partition function, exact or estimated.
+    Images are in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
+    Log Z may be exact or estimated.
 
     Raises:
         SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
@@ -113,7 +105,7 @@ def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState
         field = rows @ weight.mT + c.unsqueeze(-2)
         return softplus(field).sum(-1) + (rows @ b.unsqueeze(-1)).squeeze(-1)
 
-    return _in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
+    return in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
 
 
 def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
@@ -124,21 +116,13 @@ def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) ->
 
 
 @torch.no_grad()
-def kl_divergence(
-    model: EnergyModel,
-    v: Images,
-    log_z: PerReplica | None = None,
-) -> PerReplica:
+def kl_divergence(model: EnergyModel, v: Images, log_z: PerReplica | None = None) -> PerReplica:
     r"""Return the divergence of the model from the empirical distribution of the rows of v, in nats and float64.
 
     .. math:: KL(p_v || p) = \sum_x p_v(x) (log p_v(x) - log p(x))
 
     over the different rows x, p_v(x) being the share of the rows that are x. States without a row add nothing.
-
-    Args:
-        model: The RBM.
-        v: Images in {0, 1}, as for :func:`log_likelihood`.
-        log_z: Log of the partition function; None enumerates (:func:`log_partition_function`).
+    Images are those of :func:`log_likelihood`; without log Z, :func:`log_partition_function` enumerates.
 
     Raises:
         SettingError: v is not binary or has the wrong shape; the smaller layer is too large to enumerate.
@@ -181,7 +165,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
             log_sum = log_hidden_sum(model, rows, max_units=MOST_HIDDEN).unsqueeze(-1)
             return -softplus(log_sums.unflatten(-1, flipped.shape[-3:-1]) - log_sum)
 
-        return _in_chunks(of_images, v, model.n_visible * model.n_units)
+        return in_chunks(of_images, v, model.n_visible * model.n_units)
     weight, b, c = parameters
 
     def of_rows(rows: Tensor) -> Tensor:
@@ -191,7 +175,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
         gain = change * b.unsqueeze(-2) + softplus(flipped).sum(-1) - softplus(field).sum(-1, keepdim=True)
         return -softplus(gain)
 
-    return _in_chunks(of_rows, v, model.n_visible * model.n_hidden)
+    return in_chunks(of_rows, v, model.n_visible * model.n_hidden)
 
 
 def _binary(model: EnergyModel, v: Tensor) -> Tensor:
@@ -212,10 +196,3 @@ def _of_rbm(model: EnergyModel) -> tuple[Tensor, Tensor, Tensor] | None:
         return None
     rbm = as_two_layers(model).rbm
     return rbm.weight.double(), rbm.b.double(), rbm.c.double()
-
-
-def _in_chunks(function: Callable[[Tensor], Tensor], v: Tensor, numbers_a_row: int) -> Tensor:
-    """Apply a function of rows, in float64, to so many rows at a time that about ``_NUMBERS`` numbers are held."""
-    n_replicas = max(1, v[..., :1, :1].numel())
-    rows = max(1, _NUMBERS // (n_replicas * numbers_a_row))
-    return torch.cat([function(part.double()) for part in v.split(rows, dim=-2)], dim=len(v.shape) - 2)

@@ -1,5 +1,6 @@
 """An RBM as seen from its smaller layer, the one that is enumerated."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -11,6 +12,9 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.rbm import RBM
 
 MOST_UNITS = 32
+
+NUMBERS = 2**23
+"""float64 numbers held at a time."""
 
 PAIRS_PER_S = 5e9
 """Pairs of an enumerated state and a unit of the other layer that one CPU thread does in a second."""
@@ -76,9 +80,7 @@ def enumerable(model: RBM, max_units: int) -> Layers:
 
 
 def log_weights(
-    layers: Layers,
-    prefixes: Float[Tensor, "#replicas prefixes n_first"],
-    second: Float[Tensor, "states n_second"],
+    layers: Layers, prefixes: Float[Tensor, "#replicas prefixes n_first"], second: Float[Tensor, "states n_second"]
 ) -> Float[Tensor, "replicas prefixes states"]:
     """Log weights of all states (t, u) in float64, without any constant left out."""
     n_first = prefixes.shape[-1]
@@ -94,6 +96,13 @@ def log_weights(
 def softplus(x: Tensor) -> Tensor:
     """log(1 + exp(x)) to all digits: torch's own threshold of 20 leaves out 2e-9."""
     return F.softplus(x, threshold=40.0)
+
+
+def in_chunks(function: Callable[[Tensor], Tensor], v: Tensor, numbers_a_row: int) -> Tensor:
+    """Apply a function of rows, in float64, to so many rows at a time that about ``NUMBERS`` numbers are held."""
+    n_replicas = max(1, v[..., :1, :1].numel())
+    rows = max(1, NUMBERS // (n_replicas * numbers_a_row))
+    return torch.cat([function(part.double()) for part in v.split(rows, dim=-2)], dim=len(v.shape) - 2)
 
 
 def _duration(seconds: float) -> str:

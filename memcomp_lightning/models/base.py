@@ -188,12 +188,8 @@ def as_two_layers(model: EnergyModel) -> TwoLayers:
         SettingError: The units do not fall into two classes.
     """
     layers = model.two_layers()
-    require(
-        layers is not None,
-        "number of classes of units",
-        len(model.classes),
-        "2, with couplings only between them, as in an RBM, a DBM or a grid",
-        "For other machines use log_partition_function, up to 32 units outside the largest class.",
-    )
+    allowed = "2, with couplings only between them, as in an RBM, a DBM or a grid"
+    remedy = "For other machines use log_partition_function, up to 32 units outside the largest class."
+    require(layers is not None, "number of classes of units", len(model.classes), allowed, remedy)
     assert layers is not None
     return layers

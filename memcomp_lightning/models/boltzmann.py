@@ -120,11 +120,9 @@ class BoltzmannMachine(Machine):
                 self.register_buffer(f"_{name}{number}", getattr(layout, name), persistent=False)
 
     def other_pairs(self, pairs: Tensor | None) -> str:
-        """Say what speaks against couplings of these pairs in this machine; empty if nothing does.
+        """Say what speaks against couplings of the pairs of a weight file in this machine; empty if nothing does.
 
-        Args:
-            pairs: Those of a weight file; None if it has none, as files of version 0.1. They are then taken to be
-                all pairs of units, and refused in any other machine.
+        A file that has none, as those of version 0.1, is taken to be of all pairs, and refused in other machines.
         """
         if pairs is None:
             known = len(self.pairs) == self.n_units * (self.n_units - 1) // 2

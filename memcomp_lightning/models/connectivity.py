@@ -127,15 +127,12 @@ def _greedy(neighbours: list[list[int]], order: Sequence[int]) -> list[int]:
 
 def _outwards(neighbours: list[list[int]]) -> list[int]:
     """Breadth first from each part's first unit: greedy colouring in this order needs two colours if two do."""
-    order, seen = [], [False] * len(neighbours)
+    order: dict[int, None] = {}  # in order of insertion
     for start in range(len(neighbours)):
-        waiting = deque([] if seen[start] else [start])
-        seen[start] = True
+        waiting = deque([start])
         while waiting:
             unit = waiting.popleft()
-            order.append(unit)
-            for other in neighbours[unit]:
-                if not seen[other]:
-                    seen[other] = True
-                    waiting.append(other)
-    return order
+            if unit not in order:
+                order[unit] = None
+                waiting.extend(neighbours[unit])
+    return list(order)

@@ -1,7 +1,7 @@
 """The deep belief network: RBMs on top of each other."""
 
-import itertools
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import cast
 
 import torch
@@ -42,10 +42,9 @@ class DBN(nn.Module):
         super().__init__()
         require_count("number of hidden layers", len(hidden_sizes))
         generator = stream(0, "weights") if generator is None else generator
-        sizes = [n_visible, *hidden_sizes]
         self.rbms = nn.ModuleList(
             RBM(n_in, n_out, replicas=replicas, weight_init=weight_init, generator=generator)
-            for n_in, n_out in itertools.pairwise(sizes)
+            for n_in, n_out in pairwise([n_visible, *hidden_sizes])
         )
 
     def __len__(self) -> int:

@@ -13,7 +13,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Visible
 from memcomp_lightning.models.dbn import DBN
-from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.init import Initialiser, initial
 from memcomp_lightning.rng import stream
 
 
@@ -41,9 +41,7 @@ class Linear(nn.Module):
         super().__init__()
         require_count("n_in", n_in)
         require_count("n_out", n_out)
-        initialiser = Gaussian(std=0.01) if weight_init is None else weight_init
-        generator = stream(0, "weights") if generator is None else generator
-        weight = initialiser((*replicas, n_out, n_in), generator=generator)
+        weight = initial((*replicas, n_out, n_in), weight_init, generator)
         self.weight = nn.Parameter(weight)
         self.bias = nn.Parameter(weight.new_zeros(*replicas, n_out))
 

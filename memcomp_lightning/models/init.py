@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel, Images
+from memcomp_lightning.rng import stream
 
 
 class Initialiser(Protocol):
@@ -61,6 +62,12 @@ class Xavier:
         """Return a tensor of this shape, drawn from ``generator``."""
         bound = self.gain * math.sqrt(6.0 / (shape[-1] + shape[-2]))
         return _empty(shape, generator).uniform_(-bound, bound, generator=generator)
+
+
+def initial(shape: tuple[int, ...], weight_init: Initialiser | None, generator: Generator | None) -> Tensor:
+    """Initial weights, by default N(0, 0.01^2) from a fresh stream of seed 0."""
+    draw = Gaussian(std=0.01) if weight_init is None else weight_init
+    return draw(shape, generator=stream(0, "weights") if generator is None else generator)
 
 
 def mean_log_odds(v: Images) -> Float[Tensor, "*axes n_visible"]:

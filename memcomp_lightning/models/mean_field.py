@@ -38,15 +38,10 @@ def mean_field(
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
     p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration
     is exact if no two free units are coupled. Each configuration stops on its own when all its means change by
-    less than the tolerance, so that they do not depend on the rest of the batch. If one does not get there in
-    ``max_iterations``, ``converged`` of its replica is False.
+    less than the tolerance > 0, so that they do not depend on the rest of the batch. If one does not get there in
+    ``max_iterations`` >= 1, ``converged`` of its replica is False.
 
-    Args:
-        model: The machine.
-        given: The clamped units in [0, 1], ``(*replicas, n, n_visible)`` or ``(*replicas, n, n_hidden)``.
-        clamped: Which units are given.
-        max_iterations: >= 1.
-        tolerance: > 0.
+    ``given`` are the clamped units in [0, 1], ``(*replicas, n, n_visible)`` or ``(*replicas, n, n_hidden)``.
     """
     n_visible = model.n_visible
     free = slice(n_visible, None) if clamped == "visible" else slice(0, n_visible)

@@ -12,9 +12,8 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import TwoLayerChains
-from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.init import Initialiser, initial
 from memcomp_lightning.models.machine import Machine
-from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
 
 
@@ -56,9 +55,7 @@ class RBM(Machine):
         super().__init__()
         require_count("n_visible", n_visible)
         require_count("n_hidden", n_hidden)
-        initialiser = Gaussian(std=0.01) if weight_init is None else weight_init
-        generator = stream(0, "weights") if generator is None else generator
-        weight = initialiser((*replicas, n_hidden, n_visible), generator=generator)
+        weight = initial((*replicas, n_hidden, n_visible), weight_init, generator)
         self.weight = nn.Parameter(weight)
         self.b = nn.Parameter(weight.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(weight.new_zeros(*replicas, n_hidden))

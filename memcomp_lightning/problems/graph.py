@@ -32,11 +32,9 @@ class Graph(Protocol):
         """Sum per-pair numbers onto the first and the second variables: ``(*leading, n)``."""
 
     def quadratic(self, coupling: Array, x: Array) -> Array:
-        """``sum over pairs of coupling x_first x_second``: ``(*leading, n_states)``.
+        """``sum over pairs of coupling x_first x_second``, ``(*leading, n_states)``.
 
-        Args:
-            coupling: ``(*leading, *edge_shape)``.
-            x: ``(*leading, n_states, n)``.
+        States ``x`` are ``(*leading, n_states, n)``.
         """
 
     def field(self, coupling: Array, x: Array) -> Array:

@@ -57,8 +57,7 @@ class Problem(Parsed):
     def score(self, x: Array) -> Score:
         """Count as the file's authors do, without rounding.
 
-        Args:
-            x: One state in {0, 1}: of the file's variables ``(n,)``, or of the problem's ``(n_used,)``.
+        ``x`` is one state in {0, 1}: of the file's variables ``(n,)``, or of the problem's ``(n_used,)``.
         """
         sizes = f"({self.n},)" + (f" or ({self.problem.n},)" if self.n_unused else "")
         require(tuple(x.shape) in ((self.n,), (self.problem.n,)), "shape of x", tuple(x.shape), sizes)

@@ -64,12 +64,7 @@ class AnnealerSamples:
 
     @torch.no_grad()
     def sample(
-        self,
-        model: EnergyModel,
-        state: AnnealerState,
-        positive: Configurations,
-        *,
-        generator: Generator,
+        self, model: EnergyModel, state: AnnealerState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[AnnealerState]:
         """Return one configuration a read."""
         qubo = from_model(model)
@@ -105,10 +100,8 @@ def maximum_pseudo_likelihood_beta(
     (Besag 1975), a concave function of one number, found by Newton's method, with bisection where
     its steps leave the bracket or do not halve.
 
-    Args:
-        field: f, energy of x_i = 1 less that of x_i = 0 given the other units.
-        x: The states in {0, 1}.
-        largest: Largest value that is returned, as for states that are all local minima; the smallest is 0.
+    ``x`` are states in {0, 1}; ``field`` is f, the energy of x_i = 1 less that of x_i = 0 given the other units.
+    The value is between 0 and ``largest``, which states get that are all local minima.
 
     >>> field, x = torch.tensor([[1.0], [1.0], [1.0], [1.0]]), torch.tensor([[0.0], [0.0], [0.0], [1.0]])
     >>> round(float(maximum_pseudo_likelihood_beta(field, x)), 4)  # log 3

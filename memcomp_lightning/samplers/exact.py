@@ -38,14 +38,12 @@ class Exact:
         Raises:
             SettingError: More than ``max_units`` units would be enumerated.
         """
-        require(
-            model.n_enumerated <= self.max_units,
-            "units to enumerate",
-            model.n_enumerated,
-            f"at most max_units = {self.max_units} for the exact sampler",
+        n, allowed = model.n_enumerated, f"at most max_units = {self.max_units} for the exact sampler"
+        remedy = (
             "Use a smaller layer or another sampler (pcd, cd), or raise max_units (at most 20): each unit "
-            "doubles time and memory.",
+            "doubles time and memory."
         )
+        require(n <= self.max_units, "units to enumerate", n, allowed, remedy)
         return NoState()
 
     @torch.no_grad()

@@ -37,13 +37,10 @@ class GroundState:
         require_choice("readout", self.readout, ("best", "time_average"))
         require_parts("solver", self.solver, "solver of QUBOs", ("minimise",))
         if self.readout == "time_average":
-            require(
-                getattr(self.solver, "record", None) is not None,
-                "solver",
-                type(self.solver).__name__,
-                "a solver that records its trajectory, for readout = 'time_average'",
-                "Use DmmSolver(record=Recording(every=8)), or readout = 'best'.",
-            )
+            kind, records = type(self.solver).__name__, getattr(self.solver, "record", None) is not None
+            allowed = "a solver that records its trajectory, for readout = 'time_average'"
+            remedy = "Use DmmSolver(record=Recording(every=8)), or readout = 'best'."
+            require(records, "solver", kind, allowed, remedy)
 
     def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> NoState:
         """Nothing to remember: every update solves a new problem."""
@@ -59,7 +56,13 @@ class GroundState:
         if self.readout == "best":
             x, weight = solution.best.unsqueeze(-2), None
         else:
-            x, weight = _visited(solution, model.b.dtype)
+            visited = solution.trajectory
+            if visited is None:
+                raise ValueError(
+                    "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
+                )
+            x = visited.assignments.flatten(-3, -2).to(model.b.dtype)
+            weight = visited.weights().flatten(-2).to(model.b.dtype)
         if order is not None:
             x = x[..., order]
         v, h = x.split((model.n_visible, model.n_hidden), dim=-1)
@@ -76,16 +79,6 @@ def problem_of(model: EnergyModel) -> tuple[Qubo, Tensor | None]:
     if pairs is not None and len(classes) == 2 and len(pairs) > 0.5 * len(classes[0]) * len(classes[1]):
         return from_model(as_two_layers(model).rbm), torch.cat(list(classes)).argsort()
     return from_model(model), None
-
-
-def _visited(solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Assignments of all records of all restarts, and the time spent in each of the low-energy stretches."""
-    if solution.trajectory is None:
-        raise ValueError(
-            "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
-        )
-    assignments, weight = solution.trajectory.assignments, solution.trajectory.weights()
-    return assignments.flatten(-3, -2).to(dtype), weight.flatten(-2).to(dtype)
 
 
 def _diagnostics(solution: QuboSolution) -> dict[str, Tensor]:

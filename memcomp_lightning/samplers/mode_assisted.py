@@ -117,9 +117,13 @@ class ModeAssisted:
         """Return the negative phase of an update with the mode, whatever the schedule says; counts nothing."""
         found = self.mode.sample(model, state.mode, positive, generator=generator)
         scale = mode_scale(model, found.configurations)
-        mixed = _mixture(found.configurations, positive, scale)
-        info = {**found.info, "mode_scale": scale}
-        return NegativePhase(mixed, state._replace(mode=found.state), info)
+        share, mode = scale.unsqueeze(-1), found.configurations
+        mixed = Configurations(
+            torch.cat((mode.v, positive.v), dim=-2),
+            torch.cat((mode.h, positive.h), dim=-2),
+            torch.cat((share * shares(mode), (1 - share) * shares(positive)), dim=-1),
+        )
+        return NegativePhase(mixed, state._replace(mode=found.state), {**found.info, "mode_scale": scale})
 
 
 def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
@@ -129,11 +133,3 @@ def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
     n_terms = 1 + sum(parameter.numel() for parameter in model.parameters()) // max(1, math.prod(model.replicas))
     scale: Tensor = depth / (4 * n_terms)
     return scale.clamp(0.0, 1.0)
-
-
-def _mixture(mode: Configurations, positive: Configurations, scale: Tensor) -> Configurations:
-    """``mode`` with the weight ``scale`` and ``positive`` with the rest."""
-    share = scale.unsqueeze(-1)
-    weights = [share * shares(mode), (1 - share) * shares(positive)]
-    v, h = (torch.cat(pair, dim=-2) for pair in ((mode.v, positive.v), (mode.h, positive.h)))
-    return Configurations(v, h, torch.cat(weights, dim=-1))

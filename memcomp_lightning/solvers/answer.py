@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +83,7 @@ class Answer:
 
 
 def write_solution(
-    path: Path, problem: Problem, solution: QuboSolution, *, solver: Mapping[str, Any], seed: int
+    path: Path, problem: Problem, solution: QuboSolution, *, solver: Mapping[str, object], seed: int
 ) -> None:
     """Write the answer to one problem as JSON, whole or not at all, with the solver's settings and its seed.
 
@@ -140,9 +139,9 @@ def _nearest(value: Exact | float) -> int | float:
     return int(value) if whole else float(value) if isinstance(value, Fraction) else value
 
 
-def _in_json(name: str, value: Exact | float) -> dict[str, Any]:
+def _in_json(name: str, value: Exact | float) -> dict[str, int | float | str]:
     """A number, and all digits of a fraction that float64 rounds."""
-    written: dict[str, Any] = {name: _nearest(value)}
+    written: dict[str, int | float | str] = {name: _nearest(value)}
     if isinstance(value, Fraction) and Fraction(repr(float(value))) != value:
         written[f"{name}_in_full"] = in_full(value)
     return written

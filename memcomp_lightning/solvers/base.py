@@ -89,9 +89,7 @@ class QuboSolver(Protocol):
     """
 
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
-        """Return the assignments found, one a restart.
+        """Return the assignments found for one or many problems of one graph, one a restart.
 
-        Args:
-            qubo: One or many problems of one graph.
-            generator: The source of random numbers, of numpy or torch, whatever the problem is made of.
+        Random numbers come from the generator, of numpy or torch, whatever the problem is made of.
         """

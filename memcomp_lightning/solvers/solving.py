@@ -41,13 +41,10 @@ def check_memory(problem: Problem, solver: QuboSolver) -> None:
     given = problem.problem
     if isinstance(solver, DmmSolver) and solver.record is not None:
         n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
-        require(
-            n_bytes // solver.record.every <= MOST_RECORDED,
-            "solver.record.every",
-            solver.record.every,
-            f"at least {1 + n_bytes // MOST_RECORDED}, for a trajectory of at most {MOST_RECORDED // 2**30} GiB",
-            "To record nothing, use solver=dmm.",
-        )
+        every, remedy = solver.record.every, "To record nothing, use solver=dmm."
+        least, gib = 1 + n_bytes // MOST_RECORDED, MOST_RECORDED // 2**30
+        allowed = f"at least {least}, for a trajectory of at most {gib} GiB"
+        require(n_bytes // every <= MOST_RECORDED, "solver.record.every", every, allowed, remedy)
     if memory_needed(given, solver) > _installed():
         raise UserError(_too_large(problem, solver))
 

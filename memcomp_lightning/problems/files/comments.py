@@ -46,16 +46,18 @@ _CONSTANT = re.compile(
 _NAMES_CONSTANT = re.compile(r"\boffset\b|\bconstant\b[\"']?\s*[:=]", re.IGNORECASE)
 
 
-def constant(source: Source, lines: list[str]) -> str | None:
-    """The number that comments give as offset or constant; None if they name none.
+def constant(source: Source, lines: list[str]) -> tuple[str, list[str]]:
+    """The number that comments give as offset or constant, and a remark on it; 0 and none if they name none.
 
     Raises:
         ProblemFileError: It is not understood, or two differ.
     """
     word = said(source, lines, _CONSTANT, _NAMES_CONSTANT, "'offset=NUMBER', or no such word")
-    if word is not None and not fits(word):
+    if word is None:
+        return "0", []
+    if not fits(word):
         raise source.fault(f"offset {quoted(word)}", "a number that float64 can hold")
-    return word
+    return word, [f"The offset {word} is counted."]
 
 
 def said(

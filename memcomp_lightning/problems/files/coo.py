@@ -22,7 +22,7 @@ def parse(source: Source, maximise: bool) -> Parsed:
     """
     lines = source.lines()
     vartype = said(source, lines, _VARTYPE, _NAMES_VARTYPE, _TYPES)
-    offset = constant(source, lines)
+    offset, counted = constant(source, lines)
     if vartype is None and (spins := next((entry for entry in comments(lines) if _SPINS.search(entry[1])), None)):
         raise source.fault(quoted(spins[1]), f"also a comment {_TYPES}", spins[0])
     table = Table.read(source, lines, 0, (3,))
@@ -30,12 +30,10 @@ def parse(source: Source, maximise: bool) -> Parsed:
         raise source.fault("no entries", "lines 'i j bias'")
     i, j = table.pairs(0, MOST_VARIABLES - 1, "variables")
     kind = (vartype or "BINARY").upper()
-    numbers = table.numbers(offset or "0")
-    terms = Terms("spin" if kind == "SPIN" else "product", i, j, numbers)
+    terms = Terms("spin" if kind == "SPIN" else "product", i, j, table.numbers(offset))
     n = 1 + max(int(i.max(initial=-1)), int(j.max(initial=-1)))
     remarks = [] if len(table.values) else ["There are no entries: the sum is empty."]
-    remarks += [] if offset is None else [f"The offset {offset} is counted."]
-    remarks += unread(lines, _COUNTED, _OTHER)
+    remarks += [*counted, *unread(lines, _COUNTED, _OTHER)]
     return from_terms(source, f"{kind} energy", n, terms, maximised=maximise, remarks=remarks)
 
 

@@ -33,7 +33,11 @@ def number(word: str) -> Exact:
     """The number that a word means; :func:`fits` says whether there is one."""
     if word.isdecimal():
         return int(word)
-    value = Fraction(word)
+    return whole_if_so(Fraction(word))
+
+
+def whole_if_so(value: Fraction) -> Exact:
+    """A fraction, as an integer if it is one."""
     return value.numerator if value.denominator == 1 else value
 
 
@@ -52,9 +56,7 @@ class Numbers:
     @staticmethod
     def of(values: Sequence[Exact]) -> "Numbers":
         """Keep numbers whose denominators have the prime factors 2 and 5, as those of decimal fractions."""
-        decimals = max(
-            (_decimals(value.denominator) for value in values if isinstance(value, Fraction)), default=0
-        )
+        decimals = max((_decimals(value.denominator) for value in values), default=0)
         scale = 10**decimals
         return Numbers(smallest([int(value * scale) for value in values]), decimals)
 
@@ -68,8 +70,7 @@ class Numbers:
     def read(words: Sequence[str]) -> "Numbers":
         """Keep what the words say; :func:`fits` is true of each."""
         parts = [_digits_and_power(word) for word in words]
-        decimals = max((-power for _, power in parts), default=0)
-        decimals = max(decimals, 0)
+        decimals = max([0, *(-power for _, power in parts)])
         integers = [digits * 10 ** (decimals + power) for digits, power in parts]
         while decimals and all(value % 10 == 0 for value in integers):
             integers, decimals = [value // 10 for value in integers], decimals - 1
@@ -88,8 +89,7 @@ class Numbers:
 
     def exact(self, integer: int) -> Exact:
         """What a sum of the integers is worth."""
-        value = Fraction(integer, 10**self.decimals)
-        return value.numerator if value.denominator == 1 else value
+        return whole_if_so(Fraction(integer, 10**self.decimals))
 
     def double(self) -> NDArray[np.float64]:
         """Each number rounded to float64, once."""

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,6 @@ class Score(NamedTuple):
     hard_unsatisfied: int = 0
 
 
-class Counting(Protocol):
-    """How an assignment is counted."""
-
-    def count(self, x: Bits) -> Score:
-        """The score of one state ``x (n,)``."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
     """What the authors of a file count, and which way.
@@ -50,7 +43,7 @@ class Objective:
     """
 
     name: str
-    counting: Counting
+    counting: "Terms | ClauseList | RbmEnergy"
     maximised: bool = False
     penalty: Exact = 0
 
@@ -65,7 +58,7 @@ class Objective:
         return value + self.penalty * score.hard_unsatisfied if score.hard_unsatisfied else value
 
 
-@dataclass(frozen=True, kw_only=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Parsed:
     """What stands in a file.
 
@@ -143,15 +136,9 @@ def from_terms(
         size = sum(int(abs(part).sum()) for part in parts)
         problem = Qubo(integers.graph, *(double(part) / 10**numbers.decimals for part in parts))
     said = [*remarks, *_repeated(i, j, problem), *_rounding(numbers.exact(size), size)]
-    return Parsed(
-        problem=problem,
-        objective=Objective(name, terms, maximised),
-        n=n,
-        variables=used.astype(np.int64),
-        remarks=tuple(said),
-        integers=integers,
-        resolved=_resolved(size, numbers.decimals, len(i)),
-    )
+    objective = Objective(name, terms, maximised)
+    resolved = _resolved(size, numbers.decimals, len(i))
+    return Parsed(problem, objective, n, used.astype(np.int64), tuple(said), integers, resolved)
 
 
 def _as_qubo(terms: Terms, n: int, values: NDArray[Any]) -> Qubo:
@@ -277,15 +264,9 @@ def from_clauses(
     empty = [f"{n_empty} hard clause{'s are' if n_empty > 1 else ' is'} empty: no assignment satisfies all."]
     said = [*remarks, *(empty if n_empty else ()), *_rounding(soft.exact(size), size)]
     listed = ClauseList(flat, np.repeat(np.arange(len(clauses)), lengths), soft, is_hard)
-    return Parsed(
-        problem=problem,
-        objective=Objective(name, listed, penalty=soft.exact(penalty)),
-        n=n,
-        variables=used - 1,
-        remarks=tuple(said),
-        integers=integers,
-        resolved=_resolved(size, soft.decimals, len(clauses)),
-    )
+    objective = Objective(name, listed, penalty=soft.exact(penalty))
+    resolved = _resolved(size, soft.decimals, len(clauses))
+    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved)
 
 
 def _penalty(total: int, one: int) -> int:

@@ -20,10 +20,9 @@ def parse(source: Source, maximise: bool) -> Parsed:
     if [n_nodes, len(i) - n_nodes] != [int(words[4]), int(words[5])]:
         found = f"{n_nodes} nodes 'i i q' and {len(i) - n_nodes} couplers 'i j q'"
         raise source.fault(found, f"{words[4]} and {words[5]}, as line {at} says")
-    offset = constant(source, lines)
-    remarks = [] if offset is None else [f"The offset {offset} is counted."]
+    offset, remarks = constant(source, lines)
     if words[2] not in ("0", "unconstrained"):
         remarks.append(f"The topology {quoted(words[2])} is not read.")
     remarks += unread(lines, counted=("offset", "constant"))
-    terms = Terms("product", i, j, table.numbers(offset or "0"))
+    terms = Terms("product", i, j, table.numbers(offset))
     return from_terms(source, "sum of q x_i x_j", n, terms, maximised=maximise, remarks=remarks)

@@ -46,5 +46,4 @@ def parse(source: Source, maximise: bool) -> Parsed:
     layers = Bipartite(n_first=len(b), n_second=len(c))
     bias = as_array(np.concatenate((double["b"], double["c"])))
     problem = from_quadratic_form(layers, as_array(double["weight"]), bias)
-    objective = Objective("E(v, h)", RbmEnergy(**double))
-    return Parsed(problem=problem, objective=objective, n=layers.n, variables=np.arange(layers.n))
+    return Parsed(problem, Objective("E(v, h)", RbmEnergy(**double)), layers.n, np.arange(layers.n))

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 MOST_VARIABLES = 10**7
 """A larger number of variables is taken for a misprint: the list of their values alone would fill the memory."""
@@ -54,7 +54,7 @@ class Packing(NamedTuple):
 
     name: str
     magic: bytes
-    open: Callable[[io.BytesIO], Any]
+    open: Callable[[io.BytesIO], io.BufferedIOBase]
 
 
 PACKINGS = {
@@ -77,7 +77,7 @@ def unpacked(path: Path, data: bytes) -> bytes:
         return data
     try:
         with packing.open(io.BytesIO(data)) as file:
-            content: bytes = file.read(MOST_UNPACKED + 1)
+            content = file.read(MOST_UNPACKED + 1)
     except (EOFError, OSError, zlib.error, lzma.LZMAError) as error:
         cause = str(error) or "an error"
         raise ProblemFileError(f"{path}: found {cause}, expected a complete {packing.name} stream.") from error

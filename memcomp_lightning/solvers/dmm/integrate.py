@@ -178,13 +178,9 @@ class ExactShortTerm(StepControl):
         self, field: Any, machine: MachineT, state: StateT, *, before: Array | None = None, shake: Shake = still
     ) -> Step:
         """Return the next state."""
-        require(
-            hasattr(field, "short_term_after"),
-            "integrator",
-            "ExactShortTerm",
-            f"a scheme that {type(field).__name__} supports",
-            "The field has no method short_term_after(machine, state, dt): use Splitting.",
-        )
+        allowed = f"a scheme that {type(field).__name__} supports"
+        remedy = "The field has no method short_term_after(machine, state, dt): use Splitting."
+        require(hasattr(field, "short_term_after"), "integrator", "ExactShortTerm", allowed, remedy)
         rate = field.derivative(machine, state).voltage
         dt = self.step_size(rate, field.stability(machine))
         state = field.bound(machine, shake(_move_voltage(state, rate, dt), dt))

@@ -1,17 +1,20 @@
 """The compiled search of ``BranchAndBound``; imported when it is needed, as numba takes time to load."""
 
-from typing import Any
-
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from memcomp_lightning.compiling import announce_compilation
 
 announce_compilation()
 
+Floats = NDArray[np.float64]
+
 
 @njit(fastmath=True, cache=True, nogil=True)
-def search(weight: Any, linear: Any, other: Any, best: float, max_nodes: int) -> Any:
+def search(
+    weight: Floats, linear: Floats, other: Floats, best: float, max_nodes: int
+) -> tuple[float, Floats, bool, int]:
     """Find the lowest energy by a depth-first search: unit d is set to 0, then to 1, then left free again.
 
     Args:

@@ -250,7 +250,7 @@ def test_chunks_of_rows_change_nothing(monkeypatch):
     rbm = small_rbm(replicas=(3,))
     v, log_z = images(rbm), log_partition_function(rbm)
     whole = log_likelihood(rbm, v, log_z), log_pseudo_likelihood(rbm, v)
-    monkeypatch.setattr("memcomp_lightning.likelihood.exact._NUMBERS", 3 * 35 * 4)
+    monkeypatch.setattr("memcomp_lightning.likelihood.layers.NUMBERS", 3 * 35 * 4)
     assert_same(log_likelihood(rbm, v, log_z), whole[0])
     assert_same(log_pseudo_likelihood(rbm, v), whole[1])
 
@@ -284,7 +284,7 @@ def test_exact_samples_have_the_distribution_of_the_model(sizes, monkeypatch):
     rbm = small_rbm(*sizes, replicas=(2,), std=2.0)
     # A prefix and a rest, in chunks that do not divide the samples.
     monkeypatch.setattr("memcomp_lightning.likelihood.exact.N_SECOND", 1)
-    monkeypatch.setattr("memcomp_lightning.likelihood.exact._NUMBERS", 50_000)
+    monkeypatch.setattr("memcomp_lightning.likelihood.exact.NUMBERS", 50_000)
     v = exact_samples(rbm, 20_011, generator=rng.stream(0, "samples"))
     assert v.shape == (2, 20_011, rbm.n_visible)
     assert v.dtype == rbm.b.dtype
