@@ -54,7 +54,6 @@ class HasTotalEnergy(Protocol):
 
     def total_energy(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor:
         """Sum of ``weight * E(v, h)`` over configurations, ``(*replicas,)``; weights of any sign."""
-        ...
 
 
 class HasCentredEnergy(HasTotalEnergy, Protocol):
@@ -64,7 +63,6 @@ class HasCentredEnergy(HasTotalEnergy, Protocol):
         self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
     ) -> Tensor:
         """The same sum; its gradient is that of the centred parametrisation, in the model's own parameters."""
-        ...
 
 
 def contrast(

@@ -83,12 +83,11 @@ def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None 
         return cast(alike(draw, like), like.dtype) if is_floating(like) else alike(draw, like)
     import torch
 
-    of_numpy = isinstance(like, np.ndarray)
     wanted = torch.float32
     if like is not None and is_floating(like):
-        wanted = getattr(torch, str(like.dtype)) if of_numpy else like.dtype
+        wanted = getattr(torch, like.dtype.name) if isinstance(like, np.ndarray) else like.dtype
     draw = torch.empty(tuple(shape), device=generator.device, dtype=wanted).uniform_(generator=generator)
-    return draw if like is None else alike(draw, like) if of_numpy else draw.to(like.device)
+    return draw if like is None else alike(draw, like)
 
 
 def bernoulli(probability: Array, *, generator: "Generator") -> Array:

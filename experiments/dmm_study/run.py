@@ -26,7 +26,6 @@ from memcomp_lightning.solvers.dmm import (
     BondField,
     ClauseField,
     DmmSolver,
-    ExactShortTerm,
     Heun,
     Splitting,
     Strang,
@@ -152,7 +151,6 @@ def integrators(study: Study) -> None:
         f"Splitting, lag {own.lag:g}": (partial(Splitting, lag=own.lag), 1),
         "Splitting": (Splitting, 1),
         "AdaptiveEuler": (AdaptiveEuler, 1),
-        "ExactShortTerm": (ExactShortTerm, 1),
         "Strang": (Strang, 2),
         "Heun": (Heun, 2),
     }

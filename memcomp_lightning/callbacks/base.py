@@ -61,11 +61,9 @@ class ShownModel(EnergyModel, Protocol):
 
     def mean_energy(self, configurations: Configurations) -> Tensor:
         """Weighted mean of E(v, h), ``(*replicas,)``."""
-        ...
 
     def visible_mean(self, h: Tensor) -> Tensor:
         """E[v | h]."""
-        ...
 
 
 def prefix_of(module: pl.LightningModule) -> str:

@@ -4,7 +4,6 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from torch import Tensor
 
 from memcomp_lightning.callbacks.base import required
 from memcomp_lightning.training import BestPass, Score
@@ -59,8 +58,3 @@ class BestWeights(pl.Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         self._best.accuracy, self._best.weights = state_dict["accuracy"], state_dict["weights"]
-
-    @property
-    def accuracy(self) -> Tensor | None:
-        """The highest so far, ``(*replicas,)``; None before the first pass."""
-        return self._best.accuracy

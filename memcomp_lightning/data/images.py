@@ -90,7 +90,6 @@ class ImageSource(Protocol):
 
     def load(self) -> ImageData:
         """Return the images, from memory, from disk or from the network."""
-        ...
 
 
 def same_patterns(

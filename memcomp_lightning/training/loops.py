@@ -32,11 +32,9 @@ class Batches(Protocol):
 
     def __iter__(self) -> Iterator[Batch]:
         """The batches of the present pass."""
-        ...
 
     def set_epoch(self, epoch: int) -> None:
         """Take the order of a pass, by its number from 0 in the stage."""
-        ...
 
 
 class Pass(NamedTuple):

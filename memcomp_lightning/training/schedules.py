@@ -28,11 +28,9 @@ class Schedule(Protocol):
 
     def check(self, optimizer: Optimizer) -> None:
         """Raise a SettingError for an optimiser without the settings that this schedule changes."""
-        ...
 
     def begin_pass(self, optimizer: Optimizer, iteration: int) -> None:
         """Change the optimiser for a pass, numbered from 0 in the stage or, in greedy pretraining, the layer."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from memcomp_lightning.solvers.dmm import (
     BondField,
     ClauseField,
     DmmSolver,
-    ExactShortTerm,
     Heun,
     Recording,
     Splitting,
@@ -25,7 +24,7 @@ from memcomp_lightning.solvers.dmm import (
 
 COUNT = "an integer >= 1"
 POSITIVE = "a number > 0"
-SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
+SCHEMES = [AdaptiveEuler, Splitting, Strang, Heun]
 REFUSED = [
     (CD, {"k": 0}, COUNT),
     (CD, {"k": 1.5}, COUNT),

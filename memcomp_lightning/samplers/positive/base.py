@@ -25,4 +25,3 @@ class PositivePhaseSampler(Protocol):
 
     def sample(self, model: EnergyModel, v: Tensor, *, generator: Generator) -> PositivePhase:
         """Return configurations for data ``(*replicas, n, n_visible)`` in [0, 1]."""
-        ...

@@ -5,7 +5,6 @@ from memcomp_lightning.solvers.dmm.bond import BondField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import (
     AdaptiveEuler,
-    ExactShortTerm,
     Heun,
     Integrator,
     Splitting,
@@ -19,7 +18,6 @@ __all__ = [
     "BondField",
     "ClauseField",
     "DmmSolver",
-    "ExactShortTerm",
     "Heun",
     "Integrator",
     "Recording",

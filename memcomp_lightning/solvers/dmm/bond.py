@@ -156,14 +156,6 @@ class BondField:
             field_long_term=self.delta * state.field_short_term - self.zeta,
         )
 
-    def short_term_after(self, machine: BondMachine, state: BondState, dt: Array) -> dict[str, Array]:
-        """X at frozen voltages and Y moves in a straight line: the exact update is Euler's."""
-        rate = self.derivative(machine, state)
-        return {
-            "short_term": state.short_term + expand(dt, rate.short_term.ndim - dt.ndim) * rate.short_term,
-            "field_short_term": state.field_short_term + dt[..., None] * rate.field_short_term,
-        }
-
     def bound(self, machine: BondMachine, state: BondState) -> BondState:
         """V in [-1, 1], X in [short_term_min, 1], Y in [1, long_term_max]."""
         return BondState(

@@ -227,19 +227,6 @@ class ClauseField:
         excess = unsatisfied - self.delta
         return self.alpha * multiply_add(excess.clip(min=0), excess.clip(max=0), long_term - 1)
 
-    def short_term_after(self, machine: ClauseMachine, state: ClauseState, dt: Array) -> dict[str, Array]:
-        """x_s after ``dt`` at frozen voltages: ``(x_s + eps) exp(beta (C - gamma) dt) - eps``."""
-        xp = namespace(state.voltage)
-        after = {
-            "short_term": (state.short_term, _unsatisfaction(machine, state.voltage)[0]),
-            "longer_short_term": (state.longer_short_term, xp.min(_falsehood(machine, state.voltage), axis=-1)),
-        }
-        return {
-            name: (x + self.epsilon) * xp.exp(self.beta * (c - self.gamma) * expand(dt, c.ndim - dt.ndim))
-            - self.epsilon
-            for name, (x, c) in after.items()
-        }
-
     def bound(self, machine: ClauseMachine, state: ClauseState) -> ClauseState:
         """V in [-1, 1], x_s in [0, 1], long-term memories in [1, :meth:`most_long_term`]."""
 

@@ -168,28 +168,6 @@ class Strang(StepControl):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ExactShortTerm(StepControl):
-    """Lie splitting in which the short-term memory follows its exact solution for frozen voltages.
-
-    The field must offer ``short_term_after(machine, state, dt)``; removes the stiffness of x_s.
-    """
-
-    def step(
-        self, field: Any, machine: MachineT, state: StateT, *, before: Array | None = None, shake: Shake = still
-    ) -> Step:
-        """Return the next state."""
-        allowed = f"a scheme that {type(field).__name__} supports"
-        remedy = "The field has no method short_term_after(machine, state, dt): use Splitting."
-        require(hasattr(field, "short_term_after"), "integrator", "ExactShortTerm", allowed, remedy)
-        rate = field.derivative(machine, state).voltage
-        dt = self.step_size(rate, field.stability(machine))
-        state = field.bound(machine, shake(_move_voltage(state, rate, dt), dt))
-        exact = field.short_term_after(machine, state, dt)
-        moved = _move_memories(field, machine, state, dt)
-        return Step(field.bound(machine, moved._replace(**exact)), dt, rate)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Heun(StepControl):
     """Heun's method: the mean of the rates at both ends of an Euler step. Two evaluations, second order."""
 

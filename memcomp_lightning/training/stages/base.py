@@ -49,16 +49,13 @@ class PretrainingStage(Protocol):
     @property
     def network(self) -> nn.Module:
         """What is pretrained, and fine-tuned afterwards."""
-        ...
 
     @property
     def phases(self) -> Sequence[Phase]:
         """The models in the order of their training."""
-        ...
 
     def hand_over(self) -> None:
         """Give the network its weights, after each pass; nothing where the models are parts of it."""
-        ...
 
 
 def check_stage(stage: PretrainingStage, sampler: NegativePhaseSampler[Any, Any], seed: int) -> None:

@@ -219,25 +219,6 @@ def test_initial_memories(name):
         assert memory.equal(torch.full((2, 3, *shape), value, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("name", GRAPHS)
-def test_short_term_after_is_the_solution_of_its_equation(name):
-    """Against Euler's method in small steps: all but the short-term memories frozen."""
-    machine = OTHER.build(random_qubo(GRAPHS[name]))
-    start = state = random_state(GRAPHS[name], (), 3, OTHER)
-    time = torch.tensor([0.02, 0.5, 1.7], dtype=torch.float64)
-    for _ in range(101):
-        rate = OTHER.derivative(machine, state)
-        state = state._replace(
-            short_term=state.short_term
-            + time.view(-1, *(1,) * len(GRAPHS[name].edge_shape)) / 101 * rate.short_term,
-            field_short_term=state.field_short_term + time.view(-1, 1) / 101 * rate.field_short_term,
-        )
-    exact = OTHER.short_term_after(machine, start, time)
-    assert exact.keys() == {"short_term", "field_short_term"}
-    for key, value in exact.items():
-        torch.testing.assert_close(value, getattr(state, key), rtol=1e-10, atol=1e-10)
-
-
 def test_bounds():
     state = BondState(*(uniform(11, 7, low=-2, high=7, seed=seed) for seed in range(5)))
     bounded = OTHER.bound(OTHER.build(random_qubo(SPARSE)), state)

@@ -226,25 +226,6 @@ def test_initial_memories(name):
         assert (long_term == 1).all()
 
 
-@pytest.mark.parametrize("name", GRAPHS)
-def test_short_term_after_is_the_solution_of_its_equation(name):
-    """Against Euler's method in small steps, voltages frozen, another time for each restart."""
-    field, maxsat = OTHER, random_maxsat(GRAPHS[name], longer=True)
-    state = random_state(maxsat, 5, field.long_term_max)
-    time = torch.tensor([0.01, 0.3, 0.7, 1.1, 1.9], dtype=torch.float64)
-    exact = field.short_term_after(field.build(maxsat), state, time)
-    assert exact.keys() == {"short_term", "longer_short_term"}
-    n = 2**14
-    for key, clauses in (("short_term", pairs_by_loop(maxsat)), ("longer_short_term", longer_by_loop(maxsat))):
-        rows = [[min(falsehoods(literals, v)) for _, literals in clauses] for v in state.voltage.tolist()]
-        drive = field.beta * (torch.tensor(rows, dtype=torch.float64) - field.gamma) * time.unsqueeze(-1) / n
-        x = getattr(state, key).flatten(1).clone()
-        for _ in range(n):
-            x += drive * (x + field.epsilon)
-        torch.testing.assert_close(exact[key].flatten(1), x, rtol=1e-3, atol=1e-4)
-        assert (x - getattr(state, key).flatten(1)).abs().max() > 0.1
-
-
 def test_solution_is_a_fixed_point_of_the_bounded_voltages():
     qubo = Qubo.from_matrix(torch.tensor([[-1.0, -2.0], [0.0, -1.0]]).double())
     field = ClauseField()

@@ -25,7 +25,6 @@ from memcomp_lightning.solvers.dmm import (
     BondField,
     ClauseField,
     DmmSolver,
-    ExactShortTerm,
     Heun,
     Recording,
     Splitting,
@@ -486,7 +485,7 @@ def test_compiled_kernel_of_another_field_is_refused(field):
         DmmSolver(field=field, kernel="compiled")
 
 
-@pytest.mark.parametrize("integrator", [AdaptiveEuler(), Heun(), Strang(), ExactShortTerm()])
+@pytest.mark.parametrize("integrator", [AdaptiveEuler(), Heun(), Strang()])
 def test_compiled_kernel_of_another_integrator_is_refused_with_the_remedy(integrator):
     with pytest.raises(SettingError, match=rf"{type(integrator).__name__} has no compiled kernel: use Splitting"):
         DmmSolver(integrator=integrator, kernel="compiled")

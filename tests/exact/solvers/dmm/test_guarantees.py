@@ -15,7 +15,6 @@ from memcomp_lightning.solvers.dmm import (
     BondField,
     ClauseField,
     DmmSolver,
-    ExactShortTerm,
     Heun,
     Recording,
     Splitting,
@@ -25,7 +24,7 @@ from memcomp_lightning.solvers.dmm import (
 from memcomp_lightning.solvers.dmm.kernels import cpu, reference
 from memcomp_lightning.solvers.dmm.kernels.run import Start
 
-SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
+SCHEMES = [AdaptiveEuler, Splitting, Strang, Heun]
 FIELDS = {
     "clauses": ClauseField(),
     "clauses with noise": ClauseField(noise=2.0, spread=1.0),

@@ -8,20 +8,18 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.errors import SettingError
 from memcomp_lightning.problems import Qubo
 from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
     BondField,
     ClauseField,
     DmmSolver,
-    ExactShortTerm,
     Heun,
     Splitting,
     Strang,
 )
 
-SCHEMES = [AdaptiveEuler, Splitting, Strang, ExactShortTerm, Heun]
+SCHEMES = [AdaptiveEuler, Splitting, Strang, Heun]
 
 
 def normal(*shape, seed):
@@ -58,10 +56,6 @@ class ToyField:
     def derivative(self, machine, state):
         return Toy(voltage_rate(*state), short_rate(*state), long_rate(*state))
 
-    def short_term_after(self, machine, state, dt):
-        growth = (0.9 * (state.voltage - 0.1) * dt.unsqueeze(-1)).exp()
-        return {"short_term": (state.short_term + 0.5) * growth - 0.5}
-
     def bound(self, machine, state):
         return Toy(state.voltage.clamp(-1, 1), state.short_term.clamp(0, 1), state.long_term.clamp(1, 3))
 
@@ -84,11 +78,6 @@ def splitting(v, s, x, dt):
     return bounded(v, s + dt * short_rate(v, s, x), x + dt * long_rate(v, s, x))
 
 
-def exact_short_term(v, s, x, dt):
-    v = clip(v + dt * voltage_rate(v, s, x), -1, 1)
-    return bounded(v, (s + 0.5) * math.exp(0.9 * (v - 0.1) * dt) - 0.5, x + dt * long_rate(v, s, x))
-
-
 def strang(v, s, x, dt):
     _, s, x = bounded(v, s + dt / 2 * short_rate(v, s, x), x + dt / 2 * long_rate(v, s, x))
     v = clip(v + dt * voltage_rate(v, s, x), -1, 1)
@@ -104,7 +93,6 @@ def heun(v, s, x, dt):
 BY_HAND = {
     AdaptiveEuler: euler,
     Splitting: splitting,
-    ExactShortTerm: exact_short_term,
     Strang: strang,
     Heun: heun,
 }
@@ -231,9 +219,7 @@ def test_smooth_stretch_meets_no_bound():
     assert all((a - b).abs().max() > 0.05 for a, b in zip(start, state, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("scheme", "expected"), [(AdaptiveEuler, 1), (Splitting, 1), (ExactShortTerm, 1), (Strang, 1), (Heun, 2)]
-)
+@pytest.mark.parametrize(("scheme", "expected"), [(AdaptiveEuler, 1), (Splitting, 1), (Strang, 1), (Heun, 2)])
 def test_order_of_accuracy(scheme, expected):
     """Strang's splitting is of order 1 here, as its halves are steps of Euler's method."""
     assert order(scheme, *smooth_stretch(), duration=0.2) == pytest.approx(expected, abs=0.1)
@@ -272,18 +258,6 @@ def test_order_where_both_halves_of_a_splitting_are_exact(scheme, expected):
     assert order(scheme, PendulumField(), None, state, duration=1.0) == pytest.approx(expected, abs=0.1)
 
 
-def test_exact_short_term_has_no_error_where_the_short_term_memory_is_alone():
-    """Frozen voltages: many small steps and a single large one end at the same short-term memories."""
-    field = ClauseField(alpha=1e-30, beta=3.0, gamma=0.25, delta=0.05, epsilon=0.1, unit_pull=1e-30)
-    machine = field.build(Qubo.from_matrix(normal(7, 7, seed=1)))
-    machine = machine._replace(weight=0 * machine.weight)
-    state = field.init(machine, normal(3, 7, seed=2).tanh())
-    one, many = ends(ExactShortTerm, field, machine, state, 0.8, (1, 100))
-    torch.testing.assert_close(one, many, rtol=1e-10, atol=1e-10)
-    euler, _ = ends(Splitting, field, machine, state, 0.8, (1, 100))
-    assert (euler - many).abs().max() > 0.01
-
-
 # --- step control -----------------------------------------------------------------------------------------
 
 
@@ -315,14 +289,6 @@ def test_steps_follow_the_stability_of_each_problem(scheme):
 
 
 # --- refusals ---------------------------------------------------------------------------------------------
-
-
-def test_exact_short_term_refuses_a_field_without_the_solution():
-    state = Pendulum(torch.zeros(1, 1), torch.ones(1, 1))
-    with pytest.raises(
-        SettingError, match=r"a scheme that PendulumField supports.*short_term_after.* use Splitting"
-    ):
-        ExactShortTerm().step(PendulumField(), None, state)
 
 
 def test_state_that_is_no_named_tuple_is_refused():
