@@ -1,6 +1,7 @@
 """The compiled kernels: hand arrays to numba and share the restarts among threads."""
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -363,12 +364,13 @@ _SHORT = 2e8
 
 @cache
 def _forget_outdated(kernel: Any) -> None:
-    """Delete compiled code on disk that is older than ``common.py``, whose functions it contains.
+    """Delete compiled code on disk that is older than a file whose functions it contains.
 
     Numba compiles a function anew when its own file changes, but not when that of an inlined function does.
     """
     folder, name = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
-    inlined = max(Path(str(module.__file__)).stat().st_mtime for module in (common, digital, lanes))
+    of_fields = (sys.modules[passes.advance.py_func.__module__] for passes in FIELDS.values())
+    inlined = max(Path(str(module.__file__)).stat().st_mtime for module in (common, digital, *of_fields))
     for index in folder.glob(f"{name}.*.nbi"):
         with suppress(FileNotFoundError):  # another process was first
             if index.stat().st_mtime < inlined:
