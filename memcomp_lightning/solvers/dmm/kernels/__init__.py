@@ -1,1 +1,1 @@
-"""Kernels: loops over the steps of a DMM, in plain array operations (``reference``) or compiled for the CPU (``cpu``)."""
+"""Kernels: loops over the steps of a DMM, plain (``reference``) or compiled for the CPU (``cpu``)."""
