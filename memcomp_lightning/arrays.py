@@ -5,10 +5,11 @@ file do not wait for it.
 """
 
 import math
+from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -29,7 +30,12 @@ def as_array(x: AnyArray) -> Array:
 
 def namespace(x: Array) -> Any:
     """The functions of the array API for arrays like ``x``: numpy's, or those of torch."""
-    return np if isinstance(x, np.ndarray | np.generic) else array_namespace(x)
+    return _functions_of(type(x))
+
+
+@cache
+def _functions_of(kind: type) -> Any:
+    return np if issubclass(kind, np.ndarray | np.generic) else import_module("array_api_compat.torch")
 
 
 def alike(x: AnyArray, like: AnyArray) -> Array:

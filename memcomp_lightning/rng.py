@@ -69,25 +69,24 @@ def restore(generators: "dict[str, torch.Generator]", states: "dict[str, Tensor]
 
 
 def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None = None) -> Array:
-    """Draw from U[0, 1), as an array of the library of ``like`` on its device.
+    """Draw from U[0, 1), as an array of the library of ``like`` on its device, or else of the generator's library.
 
     It is in the dtype of ``like``, or in float32 where that holds whole numbers.
-
-    Without ``like`` it is an array of the generator's library.
     """
     if isinstance(generator, np.random.Generator):
         double = like is not None and like.dtype == namespace(like).float64
         draw = as_array(generator.random(tuple(shape), dtype=np.float64 if double else np.float32))
-        if like is None:
-            return draw
-        return cast(alike(draw, like), like.dtype) if is_floating(like) else alike(draw, like)
+        if like is None or not is_floating(like):
+            return draw if like is None else alike(draw, like)
+        return cast(alike(draw, like), like.dtype)
     import torch
 
-    wanted = torch.float32
-    if like is not None and is_floating(like):
-        wanted = getattr(torch, like.dtype.name) if isinstance(like, np.ndarray) else like.dtype
-    draw = torch.empty(tuple(shape), device=generator.device, dtype=wanted).uniform_(generator=generator)
-    return draw if like is None else alike(draw, like)
+    if isinstance(like, np.ndarray):
+        wanted = torch.empty(0, dtype=torch.float64 if like.dtype == np.float64 else torch.float32)
+        return alike(uniform(shape, generator=generator, like=wanted), like)
+    dtype = like.dtype if like is not None and like.is_floating_point() else torch.float32
+    draw = torch.empty(tuple(shape), device=generator.device, dtype=dtype).uniform_(generator=generator)
+    return draw if like is None else draw.to(like.device)
 
 
 def bernoulli(probability: Array, *, generator: "Generator") -> Array:

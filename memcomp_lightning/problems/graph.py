@@ -88,7 +88,7 @@ class Bipartite:
 
     def scatter(self, first: Array, second: Array) -> Array:
         """Sum over the columns and over the rows."""
-        return _joined(first.sum(-2), second.sum(-1))
+        return namespace(first).concat((first.sum(-2), second.sum(-1)), axis=-1)
 
     def quadratic(self, coupling: Array, x: Array) -> Array:
         """``sum_ij coupling_ij second_i first_j``."""
@@ -98,7 +98,7 @@ class Bipartite:
     def field(self, coupling: Array, x: Array) -> Array:
         """Couplings times the other layer."""
         first, second = self.split(x)
-        return _joined(second @ coupling, first @ coupling.mT)
+        return namespace(x).concat((second @ coupling, first @ coupling.mT), axis=-1)
 
     def alternating(self) -> Array:
         """+1 between the first halves of both layers and between their second halves."""
@@ -172,7 +172,3 @@ class EdgeList:
     def edges(self) -> Array:
         """The pairs."""
         return self.pairs
-
-
-def _joined(first: Array, second: Array) -> Array:
-    return namespace(first).concat((first, second), axis=-1)

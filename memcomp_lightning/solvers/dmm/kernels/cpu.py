@@ -88,7 +88,7 @@ def _run_rows(
         kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in (n_second * width, width + height)]
     arrays = (padded.kind, padded.sizes, padded.side, constants, *padded[4:])
     out = _outputs((n_problems, n_restarts), width + height, steps)
-    state = (voltage, *kept, _seeds(start.seed))
+    state = (voltage, *kept, to_numpy(start.seed).astype(np.uint64))
     work = padded.weight.size * n_restarts * steps[0]
     _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
 
@@ -157,7 +157,9 @@ def _run_lanes(
     kept = [_array(memory) for memory in start.kept]
     kept = kept or [np.zeros((n_problems, n_restarts, size), np.float32) for size in sizes]
     memories = [_to_lanes(memory, n_blocks, lanes_each) for memory in kept]
-    seed = np.ascontiguousarray(_to_lanes(_seeds(start.seed)[..., None], n_blocks, lanes_each)[:, :, 0])
+    seed = np.ascontiguousarray(
+        _to_lanes(to_numpy(start.seed).astype(np.uint64)[..., None], n_blocks, lanes_each)[:, :, 0]
+    )
     out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
     own = (passes.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
@@ -268,10 +270,6 @@ def _digital(*parts: AnyArray) -> tuple[Numbers, ...]:
 def _array(x: AnyArray) -> Numbers:
     """A contiguous float32 array."""
     return np.ascontiguousarray(to_numpy(x), np.float32)
-
-
-def _seeds(seed: Array) -> Numbers:
-    return to_numpy(seed).astype(np.uint64)
 
 
 def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Numbers, ...]:
