@@ -1,7 +1,6 @@
 """What numpy arrays and torch tensors do not share, so that problems and solvers are written once for both.
 
-Most is the Python array API standard, see :func:`namespace`. Nothing here imports torch: people with a QUBO in a
-file do not wait for it.
+Most is the Python array API standard, see :func:`namespace`. Torch is not imported before a tensor comes.
 """
 
 import math
