@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from memcomp_lightning.arrays import Array, alike, as_array, cast, is_floating, namespace
+from memcomp_lightning.arrays import AnyArray, Array, alike, as_array, cast, is_floating, namespace
 
 if TYPE_CHECKING:
     import torch
@@ -94,7 +94,7 @@ def bernoulli(probability: Array, *, generator: "Generator") -> Array:
     return cast(uniform(probability.shape, generator=generator, like=probability) < probability, probability.dtype)
 
 
-def integers(n: int, shape: Iterable[int], *, generator: "Generator", like: Array) -> Array:
+def integers(n: int, shape: Iterable[int], *, generator: "Generator", like: AnyArray) -> Array:
     """Draw int64 from 0 to n - 1, as an array of the library of ``like`` on its device."""
     if isinstance(generator, np.random.Generator):
         return alike(generator.integers(n, size=tuple(shape)), like)

@@ -10,21 +10,23 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.likelihood import log_partition_function
 from memcomp_lightning.problems import Qubo, from_model
-from memcomp_lightning.solvers import BranchAndBound
+from memcomp_lightning.solvers import BranchAndBound, GibbsAnnealing, TabuSearch
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.testing import small_rbm
 
 
 def lanes():
-    DmmSolver(n_restarts=1, max_steps=1).minimise(
-        Qubo.from_matrix(torch.ones(2, 2)), generator=rng.stream(0, "compile")
-    )
+    problem, generator = Qubo.from_matrix(torch.ones(2, 2)), rng.stream(0, "compile")
+    DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=generator)
 
 
 def others():
     problem, generator = from_model(small_rbm()), rng.stream(0, "compile")
     DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=generator)
     BranchAndBound().minimise(problem, generator=generator)
+    for solver in (GibbsAnnealing(n_sweeps=1), TabuSearch(n_steps=1)):
+        for each in (problem, Qubo.from_matrix(torch.ones(2, 2))):
+            solver.minimise(each, generator=generator)
     log_partition_function(small_rbm())
 
 

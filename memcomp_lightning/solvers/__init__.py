@@ -5,8 +5,10 @@ from memcomp_lightning.solvers.alternating_descent import AlternatingDescent
 from memcomp_lightning.solvers.annealing import GibbsAnnealing
 from memcomp_lightning.solvers.answer import Answer, write_solution
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedStates, Status
+from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.tabu import TabuSearch
 
 __all__ = [
     "AlternatingDescent",
@@ -14,10 +16,12 @@ __all__ = [
     "BranchAndBound",
     "BruteForce",
     "GibbsAnnealing",
+    "Portfolio",
     "QuboSolution",
     "QuboSolver",
     "RecordedStates",
     "Status",
+    "TabuSearch",
     "write_solution",
 ]
 

@@ -1,17 +1,29 @@
 """Simulated annealing by blocks of uncoupled variables."""
 
+import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from memcomp_lightning import rng
-from memcomp_lightning.arrays import Array, cast, double, namespace, sigmoid
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning import compiling, rng
+from memcomp_lightning.arrays import Array, alike, cast, double, namespace, sigmoid, to_numpy
+from memcomp_lightning.errors import require, require_choice, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import descend, random_states
 from memcomp_lightning.solvers.base import QuboSolution, Status
+from memcomp_lightning.solvers.compiled import (
+    Layers,
+    float32,
+    obstacle,
+    over,
+    power_of_two,
+    seeds,
+    seen_from_variables,
+    share,
+    without_zeros,
+)
 
 if TYPE_CHECKING:
     from memcomp_lightning.rng import Generator
@@ -19,58 +31,120 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GibbsAnnealing:
-    r"""Solve QUBOs by simulated annealing: block-Gibbs sweeps at a rising inverse temperature, then descent.
+    r"""Solve QUBOs by simulated annealing: Gibbs sweeps at a rising inverse temperature.
 
-    The blocks of an RBM are its layers. Inverse temperatures are geometric from ``beta_first / s`` to
-    ``beta_last / s``. The scale of the problem is ``s = \sqrt{mean_i \sum_j (Q_ij / 4)^2}`` with the couplings
-    Q_ij / 4 of the spin form; 1 where nothing is coupled.
+    A sweep draws all blocks of uncoupled variables, in an RBM its layers. Late in the schedule a copy descends to
+    a local minimum every few sweeps, and the best of these minima is the answer. Inverse temperatures are
+    geometric from ``beta_first / s`` to ``beta_last / s``. The scale of the problem is
+    ``s = \sqrt{mean_i \sum_j (Q_ij / 4)^2}`` with the couplings Q_ij / 4 of the spin form; 1 where nothing is
+    coupled.
 
     Attributes:
         n_restarts: Random starts for each problem, >= 1.
-        n_sweeps: Sweeps over all blocks, >= 1.
+        n_sweeps: Sweeps over all variables, >= 1.
         beta_first: Inverse temperature of the first sweep in units of 1 / s, > 0.
         beta_last: Inverse temperature of the last sweep in units of 1 / s, >= beta_first.
+        quench_every: Sweeps from one descent of a copy to the next, >= 1, over the last part of the schedule.
+        kernel: "compiled" for the CPU; "reference", plain operations on arrays, for any device; or "auto":
+            compiled where it can be.
     """
 
     n_restarts: int = 28
     n_sweeps: int = 100
     beta_first: float = 0.4
     beta_last: float = 12.0
+    quench_every: int = 5
+    kernel: Literal["auto", "compiled", "reference"] = "auto"
 
     def __post_init__(self) -> None:
-        require_count("n_restarts", self.n_restarts)
-        require_count("n_sweeps", self.n_sweeps)
+        for name in ("n_restarts", "n_sweeps", "quench_every"):
+            require_count(name, getattr(self, name))
         require(self.beta_first > 0, "beta_first", self.beta_first, "a number > 0")
         allowed = f"a number >= beta_first = {self.beta_first}"
         require(self.beta_last >= self.beta_first, "beta_last", self.beta_last, allowed)
+        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
+        if self.kernel == "compiled":
+            reason = obstacle("cpu")
+            require(reason is None, "kernel", self.kernel, "'auto' or 'reference' here", reason or "")
 
     @np.errstate(under="ignore")
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
-        """Return the end of each restart."""
-        begin, qubo = time.perf_counter(), qubo.floating()
-        xp = namespace(qubo.linear)
-        x = random_states(qubo, self.n_restarts, generator)
-        blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
-        growth = self.beta_last / self.beta_first
-        for beta in (self.beta_first * np.logspace(0, 1, self.n_sweeps, base=growth)).tolist():
-            beta_here = cast(beta / scale, x.dtype)[..., None, None]
-            for block in blocks:
-                p = sigmoid(-beta_here * qubo.field(x)[..., block])
-                x[..., block] = rng.bernoulli(p, generator=generator)
-        for _ in range(_DESCENTS):
-            descend(qubo, x)
-        ones = xp.ones(x.shape[:-1], dtype=xp.int64, device=x.device)
+        """Return the best state of each restart."""
+        qubo = qubo.floating()
+        begin = time.perf_counter() - compiling.seconds_spent()
+        device = getattr(qubo.linear.device, "type", "cpu")
+        compiled = self.kernel != "reference" and obstacle(device) is None and qubo.n > 0
+        x = self._compiled(qubo, generator) if compiled else self._reference(qubo, generator)
+        ones = namespace(x).ones(x.shape[:-1], dtype=namespace(x).int64, device=x.device)
         return QuboSolution(
             assignments=x,
             energies=qubo.energy(x),
             status=ones * int(Status.STEP_BUDGET),
             steps=ones * self.n_sweeps,
-            wall_time_s=time.perf_counter() - begin,
+            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
         )
 
+    @property
+    def _quench_from(self) -> int:
+        """The first sweep after which a copy descends."""
+        return math.ceil(_HOT * self.n_sweeps)
 
-_DESCENTS = 3
-"""Sweeps at zero temperature that close."""
+    def _betas(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """Inverse temperatures in units of 1 / s."""
+        growth = self.beta_last / self.beta_first
+        return self.beta_first * np.logspace(0, 1, self.n_sweeps, base=growth)
+
+    def _reference(self, qubo: Qubo, generator: "Generator") -> Array:
+        """Plain operations on arrays."""
+        xp, x, best = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator), None
+        blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
+        for sweep, beta in enumerate(self._betas().tolist()):
+            beta_here = cast(beta / scale, x.dtype)[..., None, None]
+            for block in blocks:
+                p = sigmoid(-beta_here * qubo.field(x)[..., block])
+                x[..., block] = rng.bernoulli(p, generator=generator)
+            late = sweep - self._quench_from
+            if sweep + 1 == self.n_sweeps or (late >= 0 and late % self.quench_every == 0):
+                found = xp.asarray(x, copy=True)
+                for _ in range(_DESCENTS):
+                    descend(qubo, found)
+                energies = qubo.energy(found)
+                if best is None:
+                    best, lowest = found, energies
+                best = xp.where((energies < lowest)[..., None], found, best)
+                lowest = xp.minimum(energies, lowest)
+        assert best is not None
+        return best
+
+    def _compiled(self, qubo: Qubo, generator: "Generator") -> Array:
+        """Flips are events, see ``kernels.annealing``."""
+        from memcomp_lightning.solvers.kernels import annealing, random
+
+        problem = seen_from_variables(without_zeros(qubo))
+        layered, n_problems = isinstance(problem, Layers), len(problem.own)
+        width = 1 if layered else annealing.LANES
+        n_items = n_problems * -(-self.n_restarts // width)
+        own_seeds = seeds(n_items, generator)
+        unit = power_of_two(problem.couplings, problem.own)
+        betas = float32(self._betas() * (unit / to_numpy(_scale(qubo)).ravel())[:, None])
+        best = np.zeros((n_items, qubo.n, width), np.bool_)
+        kernel = annealing.anneal_layers if layered else annealing.anneal_pairs
+        longest = qubo.n if layered else width
+        numbers = tuple(over(part, unit) if part.dtype == np.float64 else part for part in problem)
+        arguments = (numbers, betas, (self._quench_from, self.quench_every))
+        work = n_items * self.n_sweeps * width * problem.size / 10
+        share(kernel, n_items, work, (*arguments, random.thresholds(longest), own_seeds, best), (random,))
+        lanes = best.reshape(n_problems, -1, qubo.n, width).transpose(0, 1, 3, 2)
+        x = lanes.reshape(n_problems, -1, qubo.n)[:, : self.n_restarts]
+        x = x.reshape(*qubo.problems, self.n_restarts, qubo.n)
+        return cast(alike(np.ascontiguousarray(x), qubo.linear), qubo.linear.dtype)
+
+
+_HOT = 0.3
+"""Share of the schedule before the first descent: so early none leads far down."""
+
+_DESCENTS = 4
+"""Sweeps of a descent of the reference: what is left changes little."""
 
 
 def _scale(qubo: Qubo) -> Array:

@@ -1,7 +1,6 @@
 """The digital memcomputing machine as a solver of QUBO and weighted MAX-SAT."""
 
 import dataclasses
-import importlib.util
 import logging
 import math
 import time
@@ -13,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from memcomp_lightning import compiling, rng
-from memcomp_lightning.arrays import Array, alike, cast, double, namespace
+from memcomp_lightning.arrays import Array, cast, double, namespace
 from memcomp_lightning.errors import require, require_choice, require_count, require_parts
-from memcomp_lightning.problems.graph import Bipartite, EdgeList
+from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
+from memcomp_lightning.solvers.compiled import obstacle, without_zeros
 from memcomp_lightning.solvers.dmm.base import Recording, VectorField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
@@ -144,7 +144,7 @@ class DmmSolver:
         """
         begin = time.perf_counter() - compiling.seconds_spent()
         if isinstance(problem, Qubo):
-            problem = _without_zeros(problem.floating())
+            problem = without_zeros(problem.floating())
         flat = _flatten(problem)
         n_problems, device, xp = flat.offset.shape[0], flat.offset.device, namespace(flat.offset)
         n_steps = self.max_steps or default_steps(flat)
@@ -235,12 +235,8 @@ class DmmSolver:
     def _obstacle(self, device: str) -> str | None:
         """Why the compiled kernel cannot run, and what to do; None if it can."""
         integrator = self.integrator or self.field.integrator
-        if device != "cpu":
-            return f"The problem is on {device}: the plain kernel runs there."
-        if importlib.util.find_spec("numba") is None:
-            return "numba is not installed: the plain kernel is many times slower. pip install numba"
-        if (failure := _import_failure()) is not None:
-            return failure
+        if (reason := obstacle(device)) is not None:
+            return reason
         from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS
 
         if type(self.field) not in FIELDS:
@@ -284,16 +280,6 @@ def default_quench(problem: Qubo | WeightedMaxSat) -> int:
 
 
 @cache
-def _import_failure() -> str | None:
-    """Why the compiled kernels cannot be loaded; None if they can."""
-    try:
-        from memcomp_lightning.solvers.dmm.kernels import cpu  # noqa: F401
-    except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
-        return f"numba: {error}. The plain kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
-    return None
-
-
-@cache
 def _say_once(message: str) -> None:
     log.info(message)
 
@@ -316,25 +302,6 @@ def _map(problem: Qubo | WeightedMaxSat, change: Callable[[Array], Array]) -> Qu
         offset=change(problem.offset),
         longer=tuple(dataclasses.replace(block, weight=change(block.weight)) for block in problem.longer),
     )
-
-
-def _without_zeros(problem: Qubo) -> Qubo:
-    """Turn two layers with few non-zero couplings into a list of pairs, which is faster to integrate."""
-    if not isinstance(problem.graph, Bipartite):
-        return problem
-    flat = problem.coupling.reshape(*problem.problems, -1)
-    used = flat != 0
-    if used.sum() > _SPARSE * math.prod(flat.shape):
-        return problem
-    used = used.reshape(-1, flat.shape[-1]).any(0)
-    if used.sum() > _SPARSE * len(used):
-        return problem
-    pairs = alike(problem.graph.edges(), used)[used]
-    return dataclasses.replace(problem, graph=EdgeList(n=problem.n, pairs=pairs), coupling=flat[..., used])
-
-
-_SPARSE = 0.25
-"""Share of couplings below which a list is faster than a matrix."""
 
 
 def _flatten(problem: Qubo | WeightedMaxSat) -> Qubo | WeightedMaxSat:

@@ -15,7 +15,9 @@ from memcomp_lightning.solvers import (
     Answer,
     BruteForce,
     GibbsAnnealing,
+    Portfolio,
     Status,
+    TabuSearch,
     write_solution,
 )
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver
@@ -24,6 +26,8 @@ SOLVERS = {
     "brute force": BruteForce(),
     "descent": AlternatingDescent(n_restarts=12),
     "annealing": GibbsAnnealing(n_restarts=12, n_sweeps=30),
+    "tabu": TabuSearch(n_restarts=12, n_steps=50),
+    "best": Portfolio(n_restarts=12),
     "clauses": DmmSolver(n_restarts=12),
     "bonds": DmmSolver(field=BondField(), n_restarts=12),
     "reference": DmmSolver(n_restarts=12, max_steps=15, kernel="reference"),

@@ -22,7 +22,7 @@ from memcomp_lightning.samplers import (
     ParallelTempering,
     Quench,
 )
-from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing, Portfolio, TabuSearch
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
 from memcomp_lightning.training import Greedy
@@ -44,6 +44,10 @@ SOLVERS = {
     "DMM of another scheme": DmmSolver(integrator=Heun(), n_restarts=11, max_steps=101),
     "descent": AlternatingDescent(n_restarts=53),
     "annealing": GibbsAnnealing(n_restarts=53),
+    "annealing in plain operations": GibbsAnnealing(n_restarts=53, kernel="reference"),
+    "tabu": TabuSearch(n_restarts=11),
+    "tabu in plain operations": TabuSearch(n_restarts=11, n_steps=101, kernel="reference"),
+    "best": Portfolio(n_restarts=11),
     "brute force": BruteForce(),
     "brute force in chunks": BruteForce(chunk_size=13),
 }

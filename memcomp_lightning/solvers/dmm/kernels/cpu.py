@@ -1,23 +1,27 @@
 """The compiled kernels: hand arrays to numba and share the restarts among threads."""
 
-import os
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from functools import cache
-from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.arrays import AnyArray, Array, alike, to_numpy
-from memcomp_lightning.compiling import announce_compilation, n_threads
+from memcomp_lightning.arrays import Array, alike, to_numpy
+from memcomp_lightning.compiling import announce_compilation
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.compiled import (
+    Numbers,
+    float32,
+    forget_outdated,
+    grouped,
+    over,
+    power_of_two,
+    share,
+)
 from memcomp_lightning.solvers.dmm.base import Recording
 from memcomp_lightning.solvers.dmm.bond import BondField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
@@ -30,8 +34,9 @@ from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start, Visited
 
 announce_compilation()
 
-Numbers = np.ndarray[Any, Any]
 Steps = tuple[int, int, int, int, float]
+
+_INLINED = (common, digital, *(sys.modules[passes.advance.py_func.__module__] for passes in FIELDS.values()))
 
 
 def run(
@@ -77,8 +82,8 @@ def _run_rows(
     control = _control(field, integrator, stability)
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
     control[:, common.CHANGE] *= np.sqrt(n / (width + height))
-    voltage = _pad(_array(start.voltage), n_first, width, width + height)
-    kept: list[Numbers] = [_array(memory) for memory in start.kept]
+    voltage = _pad(float32(start.voltage), n_first, width, width + height)
+    kept: list[Numbers] = [float32(memory) for memory in start.kept]
     if kept:
         matrix = kept[0].reshape(n_problems, n_restarts * n_second, n_first)
         matrix = _pad(matrix, n_first, width, width).reshape(n_problems, n_restarts, n_second * width)
@@ -90,7 +95,7 @@ def _run_rows(
     out = _outputs((n_problems, n_restarts), width + height, steps)
     state = (voltage, *kept, to_numpy(start.seed).astype(np.uint64))
     work = padded.weight.size * n_restarts * steps[0]
-    _share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out))
+    share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out), _INLINED)
 
     def unpad(x: Numbers) -> Numbers:
         return np.concatenate((x[..., :n_first], x[..., width : width + n_second]), axis=-1)
@@ -134,7 +139,7 @@ def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
     scalars = np.empty((n_problems, 3))
     kind = BOND if isinstance(field, BondField) else 1 - BOND
     given = [np.ascontiguousarray(to_numpy(x), np.float64) for x in (problem.coupling, problem.linear)]
-    _forget_outdated(prepare)
+    forget_outdated(prepare, _INLINED)
     compiled: Any = prepare
     compiled(kind, width, height, *given, weight, unit, scalars, coupling, transposed, linear)
     side = np.where(2 * np.arange(width) < n_first, np.float32(0.5), np.float32(-0.5))
@@ -148,13 +153,13 @@ def _run_lanes(
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     passes, machine = FIELDS[type(field)], field.build(problem)
     constants = _constants(field, passes.constants, len(start.voltage), passes.of_problem(field, machine))
-    control = _control(field, integrator, _array(field.stability(machine)).reshape(-1))
+    control = _control(field, integrator, float32(field.stability(machine)).reshape(-1))
     n_problems, n_restarts, n = start.voltage.shape
     n_blocks, lanes_each = _blocks(n_restarts)
     sparse = _sparse(passes.listed(machine), problem, n_problems)
-    voltage = _to_lanes(_array(start.voltage), n_blocks, lanes_each)
+    voltage = _to_lanes(float32(start.voltage), n_blocks, lanes_each)
     sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
-    kept = [_array(memory) for memory in start.kept]
+    kept = [float32(memory) for memory in start.kept]
     kept = kept or [np.zeros((n_problems, n_restarts, size), np.float32) for size in sizes]
     memories = [_to_lanes(memory, n_blocks, lanes_each) for memory in kept]
     seed = np.ascontiguousarray(
@@ -168,7 +173,7 @@ def _run_lanes(
     work = (sparse.weight.size + sparse.longer_weight.size) * n_restarts * steps[0]
     ours = type(passes.kind).__module__.startswith("memcomp_lightning.")
     kernel = lanes.integrate_all if ours else _of_this_process()
-    _share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, *out))
+    share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, *out), _INLINED)
     out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
     final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
     return _finish(out, final[0], final[1:], steps, start.voltage)
@@ -200,46 +205,38 @@ def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> 
     n, n_pairs = problem.n, pairs.shape[0]
     polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
     if listed.polarity is not None:
-        polarity = _array(listed.polarity)
+        polarity = float32(listed.polarity)
     variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
     longer_weight = np.zeros((n_problems, 0), np.float32)
     if listed.longer is not None:
         variables = to_numpy(listed.longer[0])
-        longer_polarity, longer_weight = (_array(x) for x in listed.longer[1:])
+        longer_polarity, longer_weight = (float32(x) for x in listed.longer[1:])
     if isinstance(problem, Qubo):
         quadratic, block_weights = problem, []
     else:
         quadratic = to_qubo(problem.without_longer())
         block_weights = [block.weight for block in problem.longer]
-    coupling, linear, clause_weight = _digital(
-        quadratic.coupling.reshape(n_problems, n_pairs),
-        quadratic.linear,
-        np.concatenate([to_numpy(block) for block in block_weights or [quadratic.linear[:, :0]]], axis=-1),
-    )
+    weights = np.concatenate([to_numpy(block) for block in block_weights or [quadratic.linear[:, :0]]], axis=-1)
+    parts = (quadratic.coupling.reshape(n_problems, n_pairs), quadratic.linear, weights)
+    coupling, linear, clause_weight = (over(part, power_of_two(*parts)) for part in parts)
     ends = np.concatenate((pairs[:, 0], pairs[:, 1]))
-    order, offsets = _sorted(ends, n)
+    order, offsets = grouped(ends, n)
     neighbours = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
     literal_clause, literal_at = np.nonzero(longer_polarity)
-    clause_order, clause_offsets = _sorted(variables[literal_clause, literal_at], n)
+    clause_order, clause_offsets = grouped(variables[literal_clause, literal_at], n)
     of_pairs = (offsets, neighbours, order % max(n_pairs, 1), coupling)
     of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
     return _Sparse(
         pairs,
-        _array(listed.weight.reshape(n_problems, n_pairs)),
+        float32(listed.weight.reshape(n_problems, n_pairs)),
         polarity,
-        _array(listed.unit.reshape(n_problems, n)),
+        float32(listed.unit.reshape(n_problems, n)),
         variables,
         longer_polarity,
         longer_weight,
         (*of_pairs, *of_clauses),
         linear,
     )
-
-
-def _sorted(variable: Numbers, n: int) -> tuple[Numbers, Numbers]:
-    """Order that groups entries by variable, and where each variable's group begins, ``(n + 1,)``."""
-    counts = np.bincount(variable, minlength=n)
-    return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
 
 
 def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Mapping[str, Any]) -> Numbers:
@@ -257,19 +254,6 @@ def _control(field: Any, integrator: Splitting, stability: Numbers) -> Numbers:
     control = np.tile(np.array(limits, np.float32), (len(stability), 1))
     control[:, common.CHANGE] *= stability
     return control
-
-
-def _digital(*parts: AnyArray) -> tuple[Numbers, ...]:
-    """Parts of the energy over a power of two a problem, so that float32 holds them and integers stay exact."""
-    numbers = [to_numpy(part) for part in parts]
-    largest = np.max([np.abs(part).reshape(len(part), -1).max(1, initial=1e-300) for part in numbers], axis=0)
-    scale = np.exp2(np.frexp(largest)[1])
-    return tuple(_array(part / scale.reshape(-1, *(1,) * (part.ndim - 1))) for part in numbers)
-
-
-def _array(x: AnyArray) -> Numbers:
-    """A contiguous float32 array."""
-    return np.ascontiguousarray(to_numpy(x), np.float32)
 
 
 def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Numbers, ...]:
@@ -319,57 +303,3 @@ def _from_lanes(x: Numbers, n_restarts: int) -> Numbers:
     """The inverse of :func:`_to_lanes`."""
     flat = x.transpose(0, 1, 3, 2).reshape(x.shape[0], x.shape[1] * x.shape[3], x.shape[2])
     return np.ascontiguousarray(flat[:, :n_restarts])
-
-
-@cache
-def _pool(n_threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(n_threads, thread_name_prefix="memcomp-dmm")
-
-
-# Threads do not survive a fork: a child process makes its own.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-def _share(kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...]) -> None:
-    """Run items 0 to ``n_items - 1`` on as many threads as there are; ``work`` counts pairs x steps x restarts.
-
-    Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
-    """
-    if kernel.stats.cache_path is not None:
-        _forget_outdated(kernel)
-    stop = np.zeros(1, np.uint8)
-    most = min(n_threads(), n_items)
-    if most <= 1 and work < _SHORT:
-        kernel(0, n_items, stop, *arguments)
-        return
-    if not kernel.signatures:
-        kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
-    cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
-    jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
-    try:
-        for job in jobs:
-            job.result()
-    except BaseException:
-        stop[0] = 1
-        wait(jobs)
-        raise
-
-
-_SHORT = 2e8
-"""Work of less than about a second."""
-
-
-@cache
-def _forget_outdated(kernel: Any) -> None:
-    """Delete compiled code on disk that is older than a file whose functions it contains.
-
-    Numba compiles a function anew when its own file changes, but not when that of an inlined function does.
-    """
-    folder, name = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
-    of_fields = (sys.modules[passes.advance.py_func.__module__] for passes in FIELDS.values())
-    inlined = max(Path(str(module.__file__)).stat().st_mtime for module in (common, digital, *of_fields))
-    for index in folder.glob(f"{name}.*.nbi"):
-        with suppress(FileNotFoundError):  # another process was first
-            if index.stat().st_mtime < inlined:
-                index.unlink()

@@ -18,12 +18,13 @@ from memcomp_lightning.likelihood import kernel as likelihood_kernel
 from memcomp_lightning.problems import Bipartite, EdgeList, Qubo, WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.solvers import Status
+from memcomp_lightning.solvers.compiled import forget_outdated
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
 from memcomp_lightning.solvers.dmm.kernels import common, cpu, lanes, prepare, reference, rows
 from memcomp_lightning.solvers.dmm.kernels import digital as digital_state
 from memcomp_lightning.solvers.dmm.kernels import fields as compiled_fields
 from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
-from memcomp_lightning.solvers.kernels import branch_and_bound
+from memcomp_lightning.solvers.kernels import annealing, branch_and_bound, tabu
 
 # Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
 SLOW = Splitting(change=0.3, dt_min=0.01, dt_max=0.4, lag=0.2)
@@ -627,7 +628,7 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
     kernel = SimpleNamespace(
         stats=SimpleNamespace(cache_path=str(tmp_path)), py_func=lanes.integrate_all.py_func, __name__="new"
     )
-    cpu._forget_outdated.__wrapped__(kernel)
+    forget_outdated.__wrapped__(kernel, (lanes,))
     assert {path.name for path in tmp_path.iterdir()} == {"lanes.gone.nbi", "lanes.new.nbi"}
 
 
@@ -653,7 +654,7 @@ def test_passes_of_the_page_take_the_same_steps():
 
 
 ENTRIES = {"rows.integrate_all", "lanes.integrate_all", "prepare.prepare", "branch_and_bound.search"}
-ENTRIES |= {"kernel.sum_over_second"}
+ENTRIES |= {"kernel.sum_over_second", "annealing.anneal_layers", "annealing.anneal_pairs", "tabu.search"}
 
 
 def test_constants_have_the_names_of_their_places():
@@ -661,7 +662,7 @@ def test_constants_have_the_names_of_their_places():
         assert [getattr(common, name.upper()) for name in names] == list(range(len(names)))
 
 
-COMPILED = [common, digital_state, rows, lanes, prepare, branch_and_bound, likelihood_kernel]
+COMPILED = [common, digital_state, rows, lanes, prepare, branch_and_bound, annealing, tabu, likelihood_kernel]
 
 
 @pytest.mark.parametrize("module", COMPILED, ids=lambda module: module.__name__)

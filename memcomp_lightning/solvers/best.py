@@ -1,0 +1,81 @@
+"""The solver for who does not want to choose one."""
+
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from memcomp_lightning import compiling
+from memcomp_lightning.arrays import namespace
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.problems.graph import Bipartite
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.annealing import GibbsAnnealing
+from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
+from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.tabu import TabuSearch
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
+
+MOST_ENUMERATED = 12
+"""Variables up to which enumeration is as quick as any search, and a proof."""
+
+STEPS_A_SWEEP = 8
+"""Steps of a tabu search that take about as long as a sweep of annealing."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Portfolio:
+    """Solve QUBOs by what suits them: enumeration where it is quick, else annealing or tabu search.
+
+    An eighth of the restarts anneal and an eighth search, each for about the same time. Where the best of them
+    differ, the better method does the rest; where they agree, both do. What was found decides, not a clock: the
+    same seed gives the same answer on every machine.
+
+    Attributes:
+        n_restarts: Starts for each problem, >= 8.
+        effort: Factor > 0 on the sweeps of each restart; 1 is :func:`default_sweeps` of the problem.
+    """
+
+    n_restarts: int = 28
+    effort: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_count("n_restarts", self.n_restarts, 8)
+        require(0 < self.effort < math.inf, "effort", self.effort, "a number > 0")
+
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
+        """Return the best state of each restart, of the trials first; a single one where it is proven."""
+        begin = time.perf_counter() - compiling.seconds_spent()
+        graph = qubo.graph
+        enumerated = min(graph.n_first, graph.n_second) if isinstance(graph, Bipartite) else graph.n
+        if enumerated <= MOST_ENUMERATED:
+            return BruteForce(max_variables=MOST_ENUMERATED).minimise(qubo, generator=generator)
+        n_sweeps = max(10, round(self.effort * default_sweeps(qubo)))
+        anneal = GibbsAnnealing(n_restarts=self.n_restarts // 8, n_sweeps=n_sweeps)
+        search = TabuSearch(n_restarts=self.n_restarts // 8, n_steps=STEPS_A_SWEEP * n_sweeps)
+        trials: list[QuboSolver] = [anneal, search]
+        found = [solver.minimise(qubo, generator=generator) for solver in trials]
+        annealed, searched = (float(solution.best_energy.sum()) for solution in found)
+        n_left = self.n_restarts - 2 * (self.n_restarts // 8)
+        n_annealed = n_left // 2 if annealed == searched else n_left if annealed < searched else 0
+        rest: list[QuboSolver] = []
+        if n_annealed:
+            rest.append(replace(anneal, n_restarts=n_annealed))
+        if n_annealed < n_left:
+            rest.append(replace(search, n_restarts=n_left - n_annealed))
+        found += [solver.minimise(qubo, generator=generator) for solver in rest]
+        concat = namespace(found[0].energies).concat
+        return QuboSolution(
+            assignments=concat([solution.assignments for solution in found], axis=-2),
+            energies=concat([solution.energies for solution in found], axis=-1),
+            status=concat([solution.status for solution in found], axis=-1),
+            steps=concat([solution.steps for solution in found], axis=-1),
+            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
+        )
+
+
+def default_sweeps(qubo: Qubo) -> int:
+    """Sweeps of a restart: as many as there are variables, from 30 to 1,000."""
+    return min(1000, max(30, qubo.n))

@@ -1,0 +1,235 @@
+"""Hand problems to compiled kernels and restarts to threads: what all compiled solvers share."""
+
+import importlib.util
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from memcomp_lightning import rng
+from memcomp_lightning.arrays import AnyArray, alike, to_numpy
+from memcomp_lightning.compiling import n_threads
+from memcomp_lightning.problems.graph import Bipartite, EdgeList
+from memcomp_lightning.problems.qubo import Qubo
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
+
+Numbers = NDArray[Any]
+
+
+# ----------------------------------------------------------------------------------------------------- the problem
+
+
+class Layers(NamedTuple):
+    """Two fully coupled layers, problems on one axis, in float64.
+
+    Attributes:
+        of_first: Couplings of each unit of the first layer, ``(n_problems, n_first, n_second)``.
+        of_second: Its transpose.
+        own: The linear part, ``(n_problems, n)``.
+    """
+
+    of_first: Numbers
+    of_second: Numbers
+    own: Numbers
+
+    @property
+    def couplings(self) -> Numbers:
+        """Each coupling once."""
+        return self.of_first
+
+    @property
+    def size(self) -> int:
+        """Couplings of a problem."""
+        return self.of_first[0].size
+
+    @property
+    def strength(self) -> Numbers:
+        """Sum of the sizes of the couplings of each variable, ``(n_problems, n)``."""
+        size = np.abs(self.of_first)
+        return np.concatenate((size.sum(2), size.sum(1)), axis=1)
+
+
+class Neighbours(NamedTuple):
+    """Listed pairs, seen from each variable, problems on one axis, in float64.
+
+    Attributes:
+        begins: Where the neighbours of each variable begin, ``(n + 1,)``.
+        variables: The neighbours, ``(n_entries,)``; each pair stands there twice.
+        couplings: ``(n_problems, n_entries)``.
+        own: The linear part, ``(n_problems, n)``.
+    """
+
+    begins: Numbers
+    variables: Numbers
+    couplings: Numbers
+    own: Numbers
+
+    @property
+    def size(self) -> int:
+        """Couplings of a problem."""
+        return len(self.variables) // 2
+
+    @property
+    def strength(self) -> Numbers:
+        """Sum of the sizes of the couplings of each variable, ``(n_problems, n)``."""
+        total = np.cumsum(np.abs(self.couplings), axis=1)
+        total = np.concatenate((np.zeros((len(total), 1)), total), axis=1)
+        return np.diff(total[:, self.begins], axis=1)
+
+
+def seen_from_variables(qubo: Qubo) -> Layers | Neighbours:
+    """The couplings of each variable, as the kernels read them."""
+    coupling, own = (to_numpy(part).astype(np.float64) for part in (qubo.coupling, qubo.linear))
+    own = own.reshape(math.prod(qubo.problems), qubo.n)
+    if isinstance(qubo.graph, Bipartite):
+        of_second = np.ascontiguousarray(coupling.reshape(-1, *qubo.graph.edge_shape))
+        return Layers(np.ascontiguousarray(of_second.transpose(0, 2, 1)), of_second, own)
+    pairs = to_numpy(qubo.graph.edges())
+    order, begins = grouped(pairs.T.ravel(), qubo.n)
+    others = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
+    twice = np.tile(coupling.reshape(len(own), -1), 2)
+    return Neighbours(begins, others, np.ascontiguousarray(twice[:, order]), own)
+
+
+def grouped(variable: Numbers, n: int) -> tuple[Numbers, Numbers]:
+    """Order that groups entries by variable, and where each variable's group begins, ``(n + 1,)``."""
+    counts = np.bincount(variable, minlength=n)
+    return np.argsort(variable, kind="stable"), np.concatenate(([0], np.cumsum(counts)))
+
+
+SPARSE = 0.25
+"""Share of the couplings of two layers below which a list is faster than a matrix."""
+
+
+def without_zeros(qubo: Qubo) -> Qubo:
+    """Turn two layers with few couplings other than zero into a list of pairs, which is faster."""
+    if not isinstance(qubo.graph, Bipartite):
+        return qubo
+    flat = qubo.coupling.reshape(*qubo.problems, -1)
+    used = (flat != 0).reshape(-1, flat.shape[-1]).any(0)
+    if used.sum() > SPARSE * len(used):
+        return qubo
+    pairs = alike(qubo.graph.edges(), used)[used]
+    return Qubo(EdgeList(n=qubo.n, pairs=pairs), flat[..., used], qubo.linear, qubo.offset)
+
+
+def power_of_two(*parts: AnyArray) -> Numbers:
+    """A power of two above the largest number of each problem, ``(n_problems,)``: over it, integers stay exact.
+
+    Args:
+        parts: ``(n_problems, ...)`` each.
+    """
+    sizes = [np.abs(to_numpy(part)).reshape(len(part), -1) for part in parts]
+    return np.exp2(np.frexp(np.max([size.max(1, initial=1e-300) for size in sizes], axis=0))[1])
+
+
+def over(part: AnyArray, unit: Numbers) -> Numbers:
+    """Numbers of each problem in its unit, in float32."""
+    numbers = to_numpy(part)
+    return float32(numbers / unit.reshape(-1, *(1,) * (numbers.ndim - 1)))
+
+
+def float32(x: AnyArray) -> Numbers:
+    """A contiguous float32 array."""
+    return np.ascontiguousarray(to_numpy(x), np.float32)
+
+
+# ----------------------------------------------------------------------------------------------------- the threads
+
+
+def seeds(n: int, generator: "Generator") -> NDArray[np.uint64]:
+    """A seed for each piece of work, so that the answer does not depend on the number of threads."""
+    return to_numpy(rng.integers(2**62, (n,), generator=generator, like=np.zeros(0))).astype(np.uint64)
+
+
+def obstacle(device: str) -> str | None:
+    """Why compiled kernels cannot run, and what to do; None if they can."""
+    if device != "cpu":
+        return f"The problem is on {device}: the plain kernel runs there."
+    if importlib.util.find_spec("numba") is None:
+        return "numba is not installed: the plain kernel is many times slower. pip install numba"
+    return _import_failure()
+
+
+@cache
+def _import_failure() -> str | None:
+    try:
+        from memcomp_lightning.solvers.dmm.kernels import cpu  # noqa: F401
+    except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
+        return f"numba: {error}. The plain kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
+    return None
+
+
+def share(
+    kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...], inlined: Sequence[ModuleType] = ()
+) -> None:
+    """Run items 0 to ``n_items - 1`` on as many threads as there are.
+
+    Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
+
+    Args:
+        kernel: Called with the first item, one past the last, an array that is other than 0 to stop it, and
+            ``arguments``.
+        n_items: Independent pieces of work.
+        work: Operations in all, about.
+        arguments: The kernel's.
+        inlined: Modules whose functions become part of the kernel.
+    """
+    forget_outdated(kernel, tuple(inlined))
+    stop = np.zeros(1, np.uint8)
+    most = min(n_threads(), n_items)
+    if most <= 1 and work < _SHORT:
+        kernel(0, n_items, stop, *arguments)
+        return
+    if not kernel.signatures:
+        kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
+    cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
+    jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
+    try:
+        for job in jobs:
+            job.result()
+    except BaseException:
+        stop[0] = 1
+        wait(jobs)
+        raise
+
+
+_SHORT = 2e8
+"""Work of less than about a second."""
+
+
+@cache
+def _pool(n: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(n, thread_name_prefix="memcomp-solver")
+
+
+# Threads do not survive a fork: a child process makes its own.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+@cache
+def forget_outdated(kernel: Any, inlined: tuple[ModuleType, ...]) -> None:
+    """Delete compiled code on disk that is older than a module whose functions it contains.
+
+    Numba compiles a function anew when its own file changes, but not when that of an inlined function does.
+    """
+    if kernel.stats.cache_path is None or not inlined:
+        return
+    folder, name = Path(kernel.stats.cache_path), kernel.py_func.__module__.rpartition(".")[2]
+    newest = max(Path(str(module.__file__)).stat().st_mtime for module in inlined)
+    for index in folder.glob(f"{name}.*.nbi"):
+        with suppress(FileNotFoundError):  # another process was first
+            if index.stat().st_mtime < newest:
+                index.unlink()

@@ -1,0 +1,156 @@
+"""Tabu search: the best flip, again and again, without undoing the last ones."""
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from memcomp_lightning import compiling, rng
+from memcomp_lightning.arrays import Array, alike, cast, namespace
+from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.alternating_descent import random_states
+from memcomp_lightning.solvers.base import QuboSolution, Status
+from memcomp_lightning.solvers.compiled import (
+    Layers,
+    Neighbours,
+    Numbers,
+    obstacle,
+    seeds,
+    seen_from_variables,
+    share,
+    without_zeros,
+)
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TabuSearch:
+    """Solve QUBOs by one-flip tabu search (Glover, Kochenberger & Alidaee 1998), in whole numbers.
+
+    Each step flips the variable that lowers the energy most, or raises it least, but none that flipped lately,
+    unless it leads below the best energy. Where nothing better was found for long, the search goes on from its
+    best state with some variables flipped at random (Palubeckis 2006). Couplings are rounded to 30 bits; the
+    energies of the answer are computed from the assignments.
+
+    Attributes:
+        n_restarts: Random starts for each problem, >= 1.
+        n_steps: Flips of a restart, >= 1; None is 20 for each variable, at least 500.
+        tenure: Steps for which a variable does not flip back, >= 0; None is 10, or a quarter of the variables if
+            they are fewer than 40. Up to as many again are added at random.
+        patience: Steps without anything better before the search goes back to its best state, >= 1; None is 5 for
+            each variable.
+        kick: Share of the variables that are flipped then, in (0, 1].
+        kernel: "compiled" for the CPU; "reference", plain operations on arrays, for any device; or "auto":
+            compiled where it can be.
+    """
+
+    n_restarts: int = 28
+    n_steps: int | None = None
+    tenure: int | None = None
+    patience: int | None = None
+    kick: float = 0.1
+    kernel: Literal["auto", "compiled", "reference"] = "auto"
+
+    def __post_init__(self) -> None:
+        require_count("n_restarts", self.n_restarts)
+        for name, smallest in (("n_steps", 1), ("tenure", 0), ("patience", 1)):
+            if getattr(self, name) is not None:
+                require_count(name, getattr(self, name), smallest)
+        require(0 < self.kick <= 1, "kick", self.kick, "a number in (0, 1]")
+        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
+        if self.kernel == "compiled":
+            reason = obstacle("cpu")
+            require(reason is None, "kernel", self.kernel, "'auto' or 'reference' here", reason or "")
+
+    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
+        """Return the best state of each restart."""
+        qubo = qubo.floating()
+        begin = time.perf_counter() - compiling.seconds_spent()
+        n_steps = self.n_steps or max(500, 20 * qubo.n)
+        device = getattr(qubo.linear.device, "type", "cpu")
+        compiled = self.kernel != "reference" and obstacle(device) is None and qubo.n > 0
+        x, found_at = (self._compiled if compiled else self._reference)(qubo, n_steps, generator)
+        xp = namespace(x)
+        return QuboSolution(
+            assignments=x,
+            energies=qubo.energy(x),
+            status=xp.where(found_at > 0.9 * n_steps, int(Status.STILL_IMPROVING), int(Status.STEP_BUDGET)),
+            steps=xp.full_like(found_at, n_steps),
+            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
+        )
+
+    def _settings(self, n: int) -> tuple[int, int, int, int]:
+        """Tenure, range of what is added to it, patience and number of variables of a kick."""
+        tenure = min(10, n // 4) if self.tenure is None else self.tenure
+        return tenure, max(1, tenure), self.patience or 5 * n, max(1, round(self.kick * n))
+
+    def _compiled(self, qubo: Qubo, n_steps: int, generator: "Generator") -> tuple[Array, Array]:
+        """Whole numbers, see ``kernels.tabu``."""
+        from memcomp_lightning.solvers.kernels import random, tabu
+
+        problem = seen_from_variables(without_zeros(qubo))
+        n_items = len(problem.own) * self.n_restarts
+        own_seeds = seeds(n_items, generator)
+        unit = _unit(problem)
+        couplings = tuple(_whole(part, unit) for part in problem[:-1])
+        best, found_at = np.zeros((n_items, qubo.n), np.bool_), np.zeros(n_items, np.int64)
+        arguments = (
+            couplings,
+            _whole(problem.own, unit),
+            n_steps,
+            self._settings(qubo.n),
+            own_seeds,
+            best,
+            found_at,
+        )
+        share(tabu.search, n_items, n_items * n_steps * qubo.n / 10, arguments, (random,))
+        each = (*qubo.problems, self.n_restarts)
+        x = cast(alike(best.reshape(*each, qubo.n), qubo.linear), qubo.linear.dtype)
+        return x, alike(found_at.reshape(each), qubo.linear)
+
+    def _reference(self, qubo: Qubo, n_steps: int, generator: "Generator") -> tuple[Array, Array]:
+        """Plain operations on arrays; all restarts go back to their best states after as many steps."""
+        xp, x = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator)
+        tenure, spread, patience, n_kicked = self._settings(qubo.n)
+        best, energy = xp.asarray(x, copy=True), qubo.energy(x)
+        lowest, found_at = energy, xp.zeros_like(energy, dtype=xp.int64)
+        lately, lately_at = energy, xp.zeros_like(found_at)
+        free_from = xp.zeros_like(x, dtype=xp.int64)
+        units = xp.arange(qubo.n, device=x.device)
+        for step in range(1, n_steps + 1 if qubo.n else 0):
+            change = (1 - 2 * x) * qubo.field(x)
+            may = (free_from <= step) | (energy[..., None] + change < lowest[..., None])
+            chosen = units == xp.where(may, change, xp.inf).argmin(-1)[..., None]
+            x = xp.where(chosen, 1 - x, x)
+            energy = qubo.energy(x)
+            wait = tenure + rng.integers(spread, energy.shape, generator=generator, like=x)
+            free_from = xp.where(chosen, step + 1 + wait[..., None], free_from)
+            better = energy < lowest
+            best, found_at = xp.where(better[..., None], x, best), xp.where(better, step, found_at)
+            lowest = xp.minimum(energy, lowest)
+            lately_at = xp.where(energy < lately, step, lately_at)
+            lately = xp.minimum(energy, lately)
+            back = step - lately_at > patience
+            if bool(back.any()):
+                kicked = rng.uniform(x.shape, generator=generator, like=x) < n_kicked / qubo.n
+                x = xp.where(back[..., None], xp.where(kicked, 1 - best, best), x)
+                energy, free_from = qubo.energy(x), xp.where(back[..., None], 0, free_from)
+                lately, lately_at = xp.where(back, energy, lately), xp.where(back, step, lately_at)
+        return best, found_at
+
+
+def _unit(problem: Layers | Neighbours) -> Numbers:
+    """What one stands for: a power of two, so that no change of the energy leaves 30 bits, ``(n_problems,)``."""
+    size = np.abs(problem.own) + problem.strength
+    return np.exp2(np.frexp(size.max(1, initial=1e-300))[1] - 29)
+
+
+def _whole(part: Numbers, unit: Numbers) -> Numbers:
+    """Rounded to whole numbers of a unit; indices stay what they are."""
+    if part.dtype != np.float64:
+        return part
+    return np.ascontiguousarray(np.rint(part / unit.reshape(-1, *(1,) * (part.ndim - 1))), np.int32)
