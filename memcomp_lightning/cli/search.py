@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.configuration.plans import require_held_out
+from memcomp_lightning.configuration.values import require_held_out
 from memcomp_lightning.errors import UserError, require
 
 

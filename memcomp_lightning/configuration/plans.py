@@ -21,7 +21,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
-from memcomp_lightning.configuration.values import check_values
+from memcomp_lightning.configuration.values import check_values, require_held_out
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
@@ -133,12 +133,6 @@ def build(config: DictConfig) -> Plan:
 def plan_of(settings: Mapping[str, object]) -> Plan:
     """Build the objects of a run from its settings as plain values."""
     return build(OmegaConf.create(dict(settings)))
-
-
-def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
-    """Refuse a run without held-out images to choose something by."""
-    share, allowed = config.data.validation_fraction, f"a share above 0 of the training images {where}"
-    require(share > 0, "data.validation_fraction", share, allowed, f"The test images would choose the {chosen}.")
 
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:

@@ -35,6 +35,12 @@ def check_values(settings: DictConfig) -> None:
     require(isinstance(seed, int) and not isinstance(seed, bool), "seed", seed, "an integer")
 
 
+def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
+    """Refuse a run without held-out images to choose something by."""
+    share, allowed = config.data.validation_fraction, f"a share above 0 of the training images {where}"
+    require(share > 0, "data.validation_fraction", share, allowed, f"The test images would choose the {chosen}.")
+
+
 def _check_finite(node: Any, name: str = "") -> None:
     """Refuse NaN and infinity, which some optimisers, samplers and solvers would accept."""
     if isinstance(node, DictConfig):

@@ -330,6 +330,22 @@ def test_problems_in_numpy_are_solved_without_torch():
     assert lowest < 0
 
 
+def test_the_command_imports_no_torch(tmp_path):
+    (tmp_path / "G1.txt").write_text("3 2\n1 2 1\n2 3 -1\n")
+    program = """
+import sys
+from memcomp_lightning.cli.solve import main
+sys.argv[1:] = ["problem=G1.txt", "solver=best"]
+main()
+assert not {"torch", "lightning", "matplotlib"} & set(sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "cut weight" in done.stdout
+
+
 @pytest.mark.parametrize("library", ["numpy", "torch"])
 @pytest.mark.parametrize(
     "solver",
