@@ -9,12 +9,14 @@ import numpy as np
 
 from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, alike, cast, double, namespace, sigmoid, to_numpy
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import descend, random_states
 from memcomp_lightning.solvers.base import QuboSolution, Status
 from memcomp_lightning.solvers.compiled import (
     Layers,
+    check_kernel,
+    device_of,
     float32,
     obstacle,
     over,
@@ -62,18 +64,14 @@ class GibbsAnnealing:
         require(self.beta_first > 0, "beta_first", self.beta_first, "a number > 0")
         allowed = f"a number >= beta_first = {self.beta_first}"
         require(self.beta_last >= self.beta_first, "beta_last", self.beta_last, allowed)
-        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
-        if self.kernel == "compiled":
-            reason = obstacle("cpu")
-            require(reason is None, "kernel", self.kernel, "'auto' or 'reference' here", reason or "")
+        check_kernel(self.kernel)
 
     @np.errstate(under="ignore")
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the best state of each restart."""
         qubo = qubo.floating()
         begin = time.perf_counter() - compiling.seconds_spent()
-        device = getattr(qubo.linear.device, "type", "cpu")
-        compiled = self.kernel != "reference" and obstacle(device) is None and qubo.n > 0
+        compiled = self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0
         x = self._compiled(qubo, generator) if compiled else self._reference(qubo, generator)
         ones = namespace(x).ones(x.shape[:-1], dtype=namespace(x).int64, device=x.device)
         return QuboSolution(

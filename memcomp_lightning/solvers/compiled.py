@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning import rng
-from memcomp_lightning.arrays import AnyArray, alike, to_numpy
+from memcomp_lightning.arrays import AnyArray, Array, alike, to_numpy
 from memcomp_lightning.compiling import n_threads
+from memcomp_lightning.errors import require, require_choice
 from memcomp_lightning.problems.graph import Bipartite, EdgeList
 from memcomp_lightning.problems.qubo import Qubo
 
@@ -153,6 +154,19 @@ def seeds(n: int, generator: "Generator") -> NDArray[np.uint64]:
     return to_numpy(rng.integers(2**62, (n,), generator=generator, like=np.zeros(0))).astype(np.uint64)
 
 
+def check_kernel(kernel: str, obstacle_here: str | None = None) -> None:
+    """Refuse an unknown kernel, and a compiled one where something speaks against it."""
+    require_choice("kernel", kernel, ("auto", "compiled", "reference"))
+    if kernel == "compiled":
+        reason = obstacle_here or obstacle("cpu")
+        require(reason is None, "kernel", kernel, "'auto' or 'reference' here", reason or "")
+
+
+def device_of(x: Array) -> str:
+    """The kind of device that ``x`` lies on; numpy's arrays lie on the CPU."""
+    return str(getattr(x.device, "type", "cpu"))
+
+
 def obstacle(device: str) -> str | None:
     """Why compiled kernels cannot run, and what to do; None if they can."""
     if device != "cpu":
@@ -165,7 +179,7 @@ def obstacle(device: str) -> str | None:
 @cache
 def _import_failure() -> str | None:
     try:
-        from memcomp_lightning.solvers.dmm.kernels import cpu  # noqa: F401
+        from memcomp_lightning.solvers.kernels import random  # noqa: F401
     except (ImportError, RuntimeError) as error:  # the second: no folder to keep compiled code in
         return f"numba: {error}. The plain kernel is many times slower; try NUMBA_CACHE_DIR=a folder of yours."
     return None

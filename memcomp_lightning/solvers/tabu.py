@@ -8,7 +8,7 @@ import numpy as np
 
 from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, alike, cast, namespace
-from memcomp_lightning.errors import require, require_choice, require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import random_states
 from memcomp_lightning.solvers.base import QuboSolution, Status
@@ -16,7 +16,10 @@ from memcomp_lightning.solvers.compiled import (
     Layers,
     Neighbours,
     Numbers,
+    check_kernel,
+    device_of,
     obstacle,
+    power_of_two,
     seeds,
     seen_from_variables,
     share,
@@ -61,18 +64,14 @@ class TabuSearch:
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), smallest)
         require(0 < self.kick <= 1, "kick", self.kick, "a number in (0, 1]")
-        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
-        if self.kernel == "compiled":
-            reason = obstacle("cpu")
-            require(reason is None, "kernel", self.kernel, "'auto' or 'reference' here", reason or "")
+        check_kernel(self.kernel)
 
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the best state of each restart."""
         qubo = qubo.floating()
         begin = time.perf_counter() - compiling.seconds_spent()
         n_steps = self.n_steps or max(500, 20 * qubo.n)
-        device = getattr(qubo.linear.device, "type", "cpu")
-        compiled = self.kernel != "reference" and obstacle(device) is None and qubo.n > 0
+        compiled = self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0
         x, found_at = (self._compiled if compiled else self._reference)(qubo, n_steps, generator)
         xp = namespace(x)
         return QuboSolution(
@@ -145,8 +144,7 @@ class TabuSearch:
 
 def _unit(problem: Layers | Neighbours) -> Numbers:
     """What one stands for: a power of two, so that no change of the energy leaves 30 bits, ``(n_problems,)``."""
-    size = np.abs(problem.own) + problem.strength
-    return np.exp2(np.frexp(size.max(1, initial=1e-300))[1] - 29)
+    return power_of_two(np.abs(problem.own) + problem.strength) * 2.0**-29
 
 
 def _whole(part: Numbers, unit: Numbers) -> Numbers:

@@ -13,12 +13,12 @@ import numpy as np
 
 from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, cast, double, namespace
-from memcomp_lightning.errors import require, require_choice, require_count, require_parts
+from memcomp_lightning.errors import require, require_count, require_parts
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, from_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
-from memcomp_lightning.solvers.compiled import obstacle, without_zeros
+from memcomp_lightning.solvers.compiled import check_kernel, device_of, obstacle, without_zeros
 from memcomp_lightning.solvers.dmm.base import Recording, VectorField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
@@ -129,10 +129,7 @@ class DmmSolver:
                     self.record.every,
                     f"an integer from 1 to max_steps = {self.max_steps}",
                 )
-        require_choice("kernel", self.kernel, ("auto", "compiled", "reference"))
-        if self.kernel == "compiled":
-            obstacle = self._obstacle("cpu")
-            require(obstacle is None, "kernel", self.kernel, "'auto' or 'reference' here", obstacle or "")
+        check_kernel(self.kernel, self._obstacle("cpu") if self.kernel == "compiled" else None)
 
     @np.errstate(under="ignore")
     def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: "Generator") -> QuboSolution:
@@ -211,8 +208,7 @@ class DmmSolver:
     def _run(self, problem: Qubo | WeightedMaxSat, start: Start, n_steps: int) -> Run:
         """Run the kernel that the settings ask for."""
         integrator = self.integrator or self.field.integrator
-        device = getattr(start.voltage.device, "type", "cpu")
-        obstacle = None if self.kernel == "reference" else self._obstacle(device)
+        obstacle = None if self.kernel == "reference" else self._obstacle(device_of(start.voltage))
         kernel: Callable[..., Run] = reference.run
         if obstacle is not None:
             _say_once(obstacle)

@@ -7,6 +7,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from memcomp_lightning.compiling import announce_compilation
+
+announce_compilation()
+
 N_THRESHOLDS = 2**16
 """Logits in the pool. With so many equally spaced quantiles a unit's probability is kept to 1e-5."""
 
