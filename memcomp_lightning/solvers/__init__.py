@@ -8,6 +8,7 @@ from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedSta
 from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.crossover import CrossoverAnnealing
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "Answer",
     "BranchAndBound",
     "BruteForce",
+    "CrossoverAnnealing",
     "GibbsAnnealing",
     "Portfolio",
     "QuboSolution",

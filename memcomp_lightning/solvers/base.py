@@ -1,7 +1,7 @@
 """What every solver of a QUBO takes and gives back, and how each restart ended."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,11 +26,12 @@ class Status(IntEnum):
     OPTIMAL = 0, "Proven: no state has a lower energy."
     CONVERGED = 1, "No block of variables improves this assignment; more restarts may find a lower one."
     STEP_BUDGET = 2, "The best assignment came long before the last step; more restarts may find a lower one."
-    STILL_IMPROVING = 3, "The best assignment came in the last tenth of the steps: raise max_steps."
-    NOT_RUN = 4, "Not run: enough restarts before it had found nothing better."
+    STILL_IMPROVING = 3, "The best assignment came in the last tenth of the steps: more steps may find a lower one."
+    NOT_RUN = 4, "Not run: enough restarts before it had found nothing better, or no time was left."
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
+    STOPPED = 8, "The time was up, or Ctrl-C came: a longer search may find a lower one."
 
 
 class RecordedStates(Protocol):
@@ -75,6 +76,18 @@ class QuboSolution:
         xp, index = namespace(self.energies), self.energies.argmin(-1)[..., None, None]
         index = xp.broadcast_to(index, (*index.shape[:-1], self.assignments.shape[-1]))
         return xp.take_along_axis(self.assignments, index, axis=-2)[..., 0, :]
+
+    def lowest(self, n: int) -> "QuboSolution":
+        """The ``n`` restarts of lowest energy of each problem, lowest first, or all if they are fewer."""
+        xp, order = namespace(self.energies), namespace(self.energies).argsort(self.energies, axis=-1)[..., :n]
+        places = xp.broadcast_to(order[..., None], (*order.shape, self.assignments.shape[-1]))
+        return replace(
+            self,
+            assignments=xp.take_along_axis(self.assignments, places, axis=-2),
+            energies=xp.take_along_axis(self.energies, order, axis=-1),
+            status=xp.take_along_axis(self.status, order, axis=-1),
+            steps=xp.take_along_axis(self.steps, order, axis=-1),
+        )
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""
