@@ -160,7 +160,7 @@ def families(cache: Path) -> list[Family]:
         Training(sampler="PCD-1", n_updates=400, **large),
         Training(sampler="DMM short", n_updates=30, **large),
     ]
-    at_horizon = {"n_tuning": 1, "n_report": 2, "horizon": 0.56}
+    at_horizon = {"n_tuning": 1, "n_report": 4, "horizon": 0.2}
     chosen = [
         *(_random("plain", 32, 32, std) for std in (0.1, 0.5, 1.0)),
         *(_random("plain", *size) for size in ((100, 100), (250, 200))),
@@ -169,7 +169,7 @@ def families(cache: Path) -> list[Family]:
         _random("mean-cancelled", 64, 64, n_tuning=0),
         *(_random("mean-cancelled with biases", *size) for size in ((32, 32), (100, 100))),
         *(_random("half-cancelled", *size) for size in ((100, 100), (250, 200))),
-        *(_random("plain", 784, 500, std, **at_horizon) for std in (0.1, 0.5, 1.0)),
+        *(_random("plain", 784, 500, std, **at_horizon | {"horizon": 0.1}) for std in (0.1, 0.5, 1.0)),
         _random("mean-cancelled", 784, 500, **at_horizon),
         *(_trained(training, cache) for training in trainings),
         *(_planted(n) for n in (60, 120, 200)),

@@ -109,6 +109,7 @@ class SimulatedAnnealing:
         {"range_over_scale": (0.4, 12.0)},
         {"range_over_scale": (0.4, 12.0), "schedule": "linear"},
         {"range_over_scale": (0.4, 6.0), "schedule": "linear"},
+        {"range_over_scale": (1.5, 6.0)},
     )
 
     range_over_scale: tuple[float, float] | None = None
@@ -138,16 +139,22 @@ class Tabu:
     """dwave-samplers' tabu search with restarts within the time; budget: milliseconds a read.
 
     Timed as reads times budget where the call took longer: the rest is its dense matrix and dimod.
+
+    Attributes:
+        tenure: Steps for which a variable stays; None is its default, 20 or a quarter of the variables.
     """
 
     name: ClassVar[str] = "tabu (dwave)"
     budgets: ClassVar[tuple[int, ...]] = (1, 3, 10, 20, 50, 100, 300, 1000)
-    variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
+    variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({}, {"tenure": 10})
+
+    tenure: int | None = None
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
         bqm, _, build = model(problem)
         begin = time.perf_counter()
-        samples = TabuSampler().sample(bqm, num_reads=n_reads, timeout=budget, seed=seed)
+        tenure = None if self.tenure is None else min(self.tenure, len(bqm) - 1)
+        samples = TabuSampler().sample(bqm, num_reads=n_reads, timeout=budget, seed=seed, tenure=tenure)
         wall = time.perf_counter() - begin
         search = min(wall, n_reads * budget * 1e-3)
         return answer(problem, samples, search, build + wall - search)

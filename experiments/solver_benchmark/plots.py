@@ -14,14 +14,17 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 STYLE = {
-    "DMM": ("#000000", "o"),
-    "DMM, steps tuned": ("#56B4E9", "o"),
-    "DMM bond, steps tuned": ("#E69F00", "o"),
+    "best": ("#000000", "*"),
+    "annealing": ("#009E73", "D"),
+    "tabu": ("#0072B2", "^"),
+    "crossover": ("#CC79A7", "X"),
+    "DMM": ("#E69F00", "o"),
+    "DMM, steps tuned": ("#F0E442", "o"),
+    "DMM bond, steps tuned": ("#8C6D31", "o"),
     "SA (dwave)": ("#D55E00", "s"),
-    "tabu (dwave)": ("#0072B2", "^"),
-    "descent": ("#999999", "v"),
-    "block-Gibbs annealing": ("#009E73", "D"),
-    "simulated bifurcation": ("#CC79A7", "P"),
+    "tabu (dwave)": ("#56B4E9", "v"),
+    "descent": ("#999999", "1"),
+    "simulated bifurcation": ("#666666", "P"),
 }
 
 
@@ -31,10 +34,10 @@ def time_to_solution(path: Path, table: Sequence[Record]) -> None:
     names = list(dict.fromkeys(record["family"] for record in table))
     if not names:
         return
-    figure, axes = plt.subplots(figsize=(9, 1.2 + 0.42 * len(names)), layout="constrained")
+    figure, axes = plt.subplots(figsize=(9, 1.2 + 0.5 * len(names)), layout="constrained")
     for solver, (colour, marker) in STYLE.items():
         rows = [record for record in table if record["solver"] == solver]
-        shift = 0.09 * (list(STYLE).index(solver) - len(STYLE) / 2 + 0.5)
+        shift = 0.075 * (list(STYLE).index(solver) - len(STYLE) / 2 + 0.5)
         for censored in (False, True):
             chosen = [
                 (names.index(r["family"]) + shift, r["TTS99"]) for r in rows if bool(r["TTS99"].mark) == censored
@@ -106,7 +109,7 @@ def planted_scaling(path: Path, outcomes: Sequence[Outcome]) -> None:
     if not planted:
         return
     figure, axes = plt.subplots(figsize=(6, 4.2), layout="constrained")
-    for solver in (DMM, SA):
+    for solver in ("best", DMM, SA):
         colour, marker = STYLE[solver]
         for outcome in planted:
             if solver not in outcome.settings:

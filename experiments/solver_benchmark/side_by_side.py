@@ -1,4 +1,4 @@
-"""Solvers that run all reads side by side: descent, block-Gibbs annealing, simulated bifurcation, the DMM."""
+"""The solvers of the package, and others that run all reads side by side: descent, simulated bifurcation."""
 
 import functools
 import time
@@ -13,12 +13,20 @@ from dwave.samplers import SteepestDescentSampler
 from opponents import Opponent, Problem, Reads, SimulatedAnnealing, Tabu, answer, energies, model
 from quadratise import quadratise
 from simulated_bifurcation.core import Ising
-from torch import Generator, Tensor
+from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.problems import Bipartite, Qubo
-from memcomp_lightning.solvers import AlternatingDescent
+from memcomp_lightning.problems import Bipartite
+from memcomp_lightning.solvers import (
+    AlternatingDescent,
+    CrossoverAnnealing,
+    GibbsAnnealing,
+    Portfolio,
+    QuboSolver,
+    TabuSearch,
+)
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, VectorField
+from memcomp_lightning.solvers.kernels.annealing import LANES
 
 
 def in_parts(problem: Problem, part: Callable[[int], tuple[Tensor, float]], n_reads: int, size: int) -> Reads:
@@ -59,60 +67,6 @@ class Descent:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GibbsAnnealing:
-    """Block Gibbs sampling with rising inverse temperature, all reads side by side; budget: sweeps.
-
-    An RBM's layers are drawn as matrix products, and three sweeps at zero temperature close. Other graphs
-    have no blocks worth the name: there it is dwave-samplers' annealing with Gibbs acceptance.
-    """
-
-    name: ClassVar[str] = "block-Gibbs annealing"
-    budgets: ClassVar[tuple[int, ...]] = (10, 30, 100, 300, 1000, 3000)
-    variants: ClassVar[tuple[Mapping[str, Any], ...]] = (
-        {},
-        {"schedule": "linear"},
-        {"range_over_scale": (0.4, 6.0), "schedule": "linear"},
-    )
-
-    range_over_scale: tuple[float, float] = (0.4, 12.0)
-    schedule: str = "geometric"
-
-    def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        qubo = quadratise(problem)
-        if not isinstance(qubo.graph, Bipartite):
-            annealing = SimulatedAnnealing(
-                range_over_scale=self.range_over_scale, schedule=self.schedule, acceptance="Gibbs"
-            )
-            return annealing.run(problem, n_reads=n_reads, budget=budget, seed=seed)
-        space = np.geomspace if self.schedule == "geometric" else np.linspace
-        betas = space(*self.range_over_scale, budget) / model(problem).scale
-        generator, graph = rng.stream(seed, "gibbs"), qubo.graph
-
-        def part(n: int) -> tuple[Tensor, float]:
-            begin = time.perf_counter()
-            x = _anneal(qubo, graph, betas, n, generator)
-            return x, time.perf_counter() - begin
-
-        return in_parts(problem, part, n_reads, 256)
-
-
-def _anneal(qubo: Qubo, graph: Bipartite, betas: np.ndarray, n_reads: int, generator: Generator) -> Tensor:
-    b, c = graph.split(qubo.linear)
-    down, up = qubo.coupling.contiguous(), qubo.coupling.mT.contiguous()
-    v = (rng.uniform((n_reads, graph.n_first), generator=generator) < 0.5).float()
-    h = v.new_zeros(n_reads, graph.n_second)
-    draw_v, draw_h = torch.empty_like(v), torch.empty_like(h)
-    for beta in betas.tolist():
-        for layer, other, weight, bias, draw in ((h, v, up, c, draw_h), (v, h, down, b, draw_v)):
-            probability = torch.addmm(bias, other, weight, beta=-beta, alpha=-beta).sigmoid_()
-            layer.copy_(draw.uniform_(generator=generator) < probability)
-    for _ in range(3):
-        h.copy_(torch.addmm(c, v, up) < 0)
-        v.copy_(torch.addmm(b, h, down) < 0)
-    return torch.cat((v, h), dim=-1)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Bifurcation:
     """The package simulated-bifurcation, all reads as agents side by side; budget: steps.
 
@@ -126,9 +80,7 @@ class Bifurcation:
     name: ClassVar[str] = "simulated bifurcation"
     budgets: ClassVar[tuple[int, ...]] = (100, 300, 1000, 3000, 10_000)
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = (
-        {},
         {"mode": "discrete"},
-        {"heated": True},
         {"mode": "discrete", "heated": True},
     )
 
@@ -166,29 +118,93 @@ def _ising(problem: Problem) -> tuple[Ising, float]:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Dmm:
-    """The package's digital memcomputing machine with all its defaults; budget: 0.
+class OfThePackage:
+    """A solver of the package, timed with everything it does, in calls as a user would make them.
 
-    Timed with everything it does. Reads come in calls of its own number of restarts, as a user would call it.
+    Budget: the setting that ``_solver`` gives it to; 0 is all defaults.
     """
 
-    name: ClassVar[str] = "DMM"
-    budgets: ClassVar[tuple[int, ...]] = (0,)
+    name: ClassVar[str]
+    budgets: ClassVar[tuple[int, ...]]
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
-    field: ClassVar[VectorField[Any, Any]] = ClauseField()
+    takes_clauses: ClassVar[bool] = False
+    restarts_a_read: ClassVar[int] = 1
+    """More than one where restarts are not independent: a read is then a whole call."""
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        raise NotImplementedError
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        solver = DmmSolver(field=self.field)
-        if budget:
-            solver = replace(solver, max_steps=budget, stall=None)
-        generator = rng.stream(seed, "dmm")
+        given = problem if self.takes_clauses else quadratise(problem)
+        generator, most = rng.stream(seed, self.name), 28 if self.restarts_a_read == 1 else 1
 
         def part(n: int) -> tuple[Tensor, float]:
             begin = time.perf_counter()
-            solution = replace(solver, n_restarts=n).minimise(problem, generator=generator)
-            return solution.assignments, time.perf_counter() - begin
+            solution = self._solver(budget, n * self.restarts_a_read).minimise(given, generator=generator)
+            seconds = time.perf_counter() - begin
+            return solution.assignments if most > 1 else solution.best[None], seconds
 
-        return in_parts(problem, part, n_reads, solver.n_restarts)
+        return in_parts(problem, part, n_reads, most)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Best(OfThePackage):
+    """The portfolio with its 28 restarts, a read a call; budget: a hundred times its effort."""
+
+    name: ClassVar[str] = "best"
+    budgets: ClassVar[tuple[int, ...]] = (30, 100, 300)
+    restarts_a_read: ClassVar[int] = 28
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        return Portfolio(n_restarts=n_restarts, effort=budget / 100)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Annealing(OfThePackage):
+    """Gibbs annealing; budget: sweeps."""
+
+    name: ClassVar[str] = "annealing"
+    budgets: ClassVar[tuple[int, ...]] = (10, 30, 100, 300, 1000, 3000)
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        return GibbsAnnealing(n_restarts=n_restarts, n_sweeps=budget)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Searching(OfThePackage):
+    """Tabu search; budget: steps."""
+
+    name: ClassVar[str] = "tabu"
+    budgets: ClassVar[tuple[int, ...]] = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        return TabuSearch(n_restarts=n_restarts, n_steps=budget)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Crossover(OfThePackage):
+    """Annealing with crossover, a read a population; budget: sweeps of the first annealing."""
+
+    name: ClassVar[str] = "crossover"
+    budgets: ClassVar[tuple[int, ...]] = (30, 100, 300, 1000, 3000)
+    restarts_a_read: ClassVar[int] = LANES
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        return CrossoverAnnealing(n_restarts=n_restarts, n_sweeps=budget)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Dmm(OfThePackage):
+    """The package's digital memcomputing machine with all its defaults; budget: 0."""
+
+    name: ClassVar[str] = "DMM"
+    budgets: ClassVar[tuple[int, ...]] = (0,)
+    takes_clauses: ClassVar[bool] = True
+    field: ClassVar[VectorField[Any, Any]] = ClauseField()
+
+    def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
+        solver: Any = DmmSolver(field=self.field, n_restarts=n_restarts)
+        return replace(solver, max_steps=budget, stall=None) if budget else solver
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -208,12 +224,16 @@ class DmmBond(DmmTuned):
 
 
 SOLVERS: tuple[type[Opponent], ...] = (
+    Best,
+    Annealing,
+    Searching,
+    Crossover,
     Dmm,
     DmmTuned,
     DmmBond,
     SimulatedAnnealing,
     Tabu,
     Descent,
-    GibbsAnnealing,
     Bifurcation,
 )
+OF_THE_PACKAGE = tuple(kind.name for kind in SOLVERS if issubclass(kind, OfThePackage))

@@ -16,14 +16,14 @@ from exact import branch_and_bound, highs
 from families import Family, Purpose
 from instances import Instance
 from opponents import Opponent, Reads
-from side_by_side import SOLVERS
+from side_by_side import OF_THE_PACKAGE, SOLVERS
 
 import memcomp_lightning
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.problems import Bipartite, Qubo, WeightedMaxSat, to_qubo
 
 Row = dict[str, Any]
-N_FINALISTS = 4
+N_FINALISTS = 3
 PACKAGES = ("dwave-samplers", "dimod", "simulated-bifurcation", "torch", "numpy", "numba", "scipy")
 
 
@@ -83,12 +83,25 @@ class Store:
 
 @functools.cache
 def version(solver: str) -> str:
-    """Changes when the numbers may: of the DMM its source, of an opponent the packages' versions."""
-    if solver.startswith("DMM"):
-        folder = Path(memcomp_lightning.__file__).parent / "solvers/dmm"
-        source = b"".join(path.read_bytes() for path in sorted(folder.rglob("*.py")))
+    """Changes when the numbers may: of the package's solvers their source, of an opponent the packages' versions."""
+    if solver in OF_THE_PACKAGE:
+        folder = Path(memcomp_lightning.__file__).parent / "solvers"
+        files = (folder / "dmm").rglob("*.py") if solver.startswith("DMM") else _SOURCES[solver]
+        paths = sorted(path if isinstance(path, Path) else folder / path for path in files)
+        source = b"".join(path.read_bytes() for path in paths)
         return hashlib.sha256(source).hexdigest()[:12]
     return " ".join(importlib.metadata.version(package) for package in PACKAGES[:3])
+
+
+_ANNEALING = ("annealing.py", "kernels/annealing.py")
+_TABU = ("tabu.py", "kernels/tabu.py")
+_CROSSOVER = ("crossover.py", "kernels/crossover.py", *_ANNEALING)
+_SOURCES: dict[str, tuple[str, ...]] = {
+    "annealing": _ANNEALING,
+    "tabu": _TABU,
+    "crossover": _CROSSOVER,
+    "best": ("best.py", *_TABU, *_CROSSOVER),
+}
 
 
 def measured(store: Store, setting: Setting, instance: Instance, purpose: Purpose, effort: Effort) -> Row:

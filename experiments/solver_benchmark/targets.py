@@ -11,16 +11,17 @@ from pathlib import Path
 import torch
 from families import Family
 from instances import Instance, random_graph_of, random_rbm
-from opponents import SimulatedAnnealing, Tabu, energies
+from opponents import SimulatedAnnealing, energies
 from sweep import Row, Store, version
 
 from memcomp_lightning import rng
 from memcomp_lightning.problems import Qubo
+from memcomp_lightning.solvers import Portfolio, QuboSolver
 from memcomp_lightning.solvers.dmm import DmmSolver
 
 N_CALLS = 10
-QUICK = DmmSolver(n_restarts=8, max_steps=200, stall=None)
-"""For 784x500: about half a second. Among those of that cost, the best on the instances to tune on."""
+SOLVERS = {"DMM": DmmSolver(), "best": Portfolio(), "best, four times the effort": Portfolio(effort=4.0)}
+"""What is called as it is: the DMM on 32x32, the portfolio on files, beside SA's 28 reads of 1,000 sweeps."""
 
 COUPLINGS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 
@@ -31,41 +32,44 @@ def reference_solver() -> DmmSolver:
 
 
 def calls(store: Store, family: Family, limit: int | None) -> Iterator[Row]:
-    """Ten warm calls on each reported instance, in turns with the opponent of the target.
+    """Warm calls on each reported instance: of the DMM on 32x32 and planted 200x200, of the portfolio on files.
 
-    All with defaults, but 784x500: the time that tabu gets there is that of few restarts, see ``QUICK``.
+    Those on files are made in turns with SA, 28 reads of 1,000 sweeps with its own temperatures.
     """
+    is_file = family.group in ("G-set", "Beasley")
+    if not is_file and family.size not in ("32x32", "200x200"):
+        return
     for instance in family.instances("report", limit):
-        settings = {
-            "purpose": "calls",
-            "family": family.name,
-            "instance": instance.name,
-            "digest": instance.digest,
-            "version": version("DMM"),
-        }
-        yield store.get(settings, lambda instance=instance: _calls(instance, family.horizon is not None))
+        for name, solver in SOLVERS.items():
+            if name.startswith("best") != is_file:
+                continue
+            settings = {
+                "purpose": "calls",
+                "family": family.name,
+                "instance": instance.name,
+                "digest": instance.digest,
+                "solver": name,
+                "version": version(name.split(",")[0]),
+            }
+            yield store.get(settings, lambda instance=instance, solver=solver: _calls(instance, solver, is_file))
 
 
-def _calls(instance: Instance, large: bool) -> Row:
-    problem, n_calls = instance.problem, 3 if large else N_CALLS
+def _calls(instance: Instance, solver: QuboSolver, beside_sa: bool) -> Row:
+    problem, n_calls = instance.problem, 3 if beside_sa else N_CALLS
     generator = rng.stream(7, f"calls {instance.name}")
-    solver = QUICK if "784" in instance.family else DmmSolver()
     solver.minimise(problem, generator=generator)
-    opponent, budget = (Tabu(), 20) if "784" in instance.family else (SimulatedAnnealing(), 1000)
     seconds, best, others, other_best = [], [], [], []
     for seed in range(n_calls):
         begin = time.perf_counter()
         solution = solver.minimise(problem, generator=generator)
         seconds.append(time.perf_counter() - begin)
         best.append(float(energies(problem, solution.assignments).min()))
-        if large:
-            reads = opponent.run(problem, n_reads=28, budget=budget, seed=seed)
+        if beside_sa:
+            reads = SimulatedAnnealing().run(problem, n_reads=28, budget=1000, seed=seed)
             others.append(reads.seconds)
             other_best.append(float(reads.energies.min()))
     row: Row = {"energies": best, "call_seconds": seconds}
-    if large:
-        row |= {"opponent": opponent.name, "opponent_seconds": others, "opponent_energies": other_best}
-    return row
+    return row | ({"opponent_seconds": others, "opponent_energies": other_best} if beside_sa else {})
 
 
 def throughput(store: Store, n_problems: int) -> Row:
