@@ -119,32 +119,34 @@ def _ising(problem: Problem) -> tuple[Ising, float]:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class OfThePackage:
-    """A solver of the package, timed with everything it does, in calls as a user would make them.
+    """A solver of the package, timed with everything it does; budget: see ``_solver``, 0 is all defaults.
 
-    Budget: the setting that ``_solver`` gives it to; 0 is all defaults.
+    Attributes:
+        reads_a_call: So many side by side.
+        restarts_a_read: More than one where restarts are not independent: a read is then a whole call.
     """
 
     name: ClassVar[str]
     budgets: ClassVar[tuple[int, ...]]
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
     takes_clauses: ClassVar[bool] = False
+    reads_a_call: ClassVar[int] = 256
     restarts_a_read: ClassVar[int] = 1
-    """More than one where restarts are not independent: a read is then a whole call."""
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
         raise NotImplementedError
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
         given = problem if self.takes_clauses else quadratise(problem)
-        generator, most = rng.stream(seed, self.name), 28 if self.restarts_a_read == 1 else 1
+        generator = rng.stream(seed, self.name)
 
         def part(n: int) -> tuple[Tensor, float]:
             begin = time.perf_counter()
             solution = self._solver(budget, n * self.restarts_a_read).minimise(given, generator=generator)
             seconds = time.perf_counter() - begin
-            return solution.assignments if most > 1 else solution.best[None], seconds
+            return solution.assignments if self.reads_a_call > 1 else solution.best[None], seconds
 
-        return in_parts(problem, part, n_reads, most)
+        return in_parts(problem, part, n_reads, self.reads_a_call)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -153,6 +155,7 @@ class Best(OfThePackage):
 
     name: ClassVar[str] = "best"
     budgets: ClassVar[tuple[int, ...]] = (30, 100, 300)
+    reads_a_call: ClassVar[int] = 1
     restarts_a_read: ClassVar[int] = 28
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
@@ -164,7 +167,7 @@ class Annealing(OfThePackage):
     """Gibbs annealing; budget: sweeps."""
 
     name: ClassVar[str] = "annealing"
-    budgets: ClassVar[tuple[int, ...]] = (10, 30, 100, 300, 1000, 3000)
+    budgets: ClassVar[tuple[int, ...]] = (3, 10, 30, 100, 300, 1000, 3000)
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
         return GibbsAnnealing(n_restarts=n_restarts, n_sweeps=budget)
@@ -175,7 +178,7 @@ class Searching(OfThePackage):
     """Tabu search; budget: steps."""
 
     name: ClassVar[str] = "tabu"
-    budgets: ClassVar[tuple[int, ...]] = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
+    budgets: ClassVar[tuple[int, ...]] = (30, 100, 300, 1000, 3000, 10_000, 30_000, 100_000)
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
         return TabuSearch(n_restarts=n_restarts, n_steps=budget)
@@ -187,6 +190,7 @@ class Crossover(OfThePackage):
 
     name: ClassVar[str] = "crossover"
     budgets: ClassVar[tuple[int, ...]] = (30, 100, 300, 1000, 3000)
+    reads_a_call: ClassVar[int] = 1
     restarts_a_read: ClassVar[int] = LANES
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:
@@ -200,6 +204,7 @@ class Dmm(OfThePackage):
     name: ClassVar[str] = "DMM"
     budgets: ClassVar[tuple[int, ...]] = (0,)
     takes_clauses: ClassVar[bool] = True
+    reads_a_call: ClassVar[int] = 28
     field: ClassVar[VectorField[Any, Any]] = ClauseField()
 
     def _solver(self, budget: int, n_restarts: int) -> QuboSolver:

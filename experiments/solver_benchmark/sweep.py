@@ -83,7 +83,7 @@ class Store:
 
 @functools.cache
 def version(solver: str) -> str:
-    """Changes when the numbers may: of the package's solvers their source, of an opponent the packages' versions."""
+    """Changes when the numbers may: of the package's solvers their source, of others the packages' versions."""
     if solver in OF_THE_PACKAGE:
         folder = Path(memcomp_lightning.__file__).parent / "solvers"
         files = (folder / "dmm").rglob("*.py") if solver.startswith("DMM") else _SOURCES[solver]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from memcomp_lightning import rng
 from memcomp_lightning.arrays import Array, cast, namespace
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, Status
 
@@ -57,9 +58,17 @@ class AlternatingDescent:
 
 
 def random_states(qubo: Qubo, n_restarts: int, generator: "Generator") -> Array:
-    """Independent states ``(*problems, n_restarts, n)`` in {0, 1}, each as likely as any other."""
+    """Independent random states ``(*problems, n_restarts, n)`` in {0, 1}.
+
+    Of two layers every other state has the second at its optimum given the first. What descends from there may
+    end elsewhere than what begins with the first: the modes of trained RBMs are found from one side alone.
+    """
     shape = (*qubo.problems, n_restarts, qubo.n)
-    return cast(rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5, qubo.linear.dtype)
+    x = cast(rng.uniform(shape, generator=generator, like=qubo.linear) < 0.5, qubo.linear.dtype)
+    if isinstance(qubo.graph, Bipartite):
+        second = slice(qubo.graph.n_first, None)
+        x[..., ::2, second] = cast(qubo.field(x[..., ::2, :])[..., second] < 0, x.dtype)
+    return x
 
 
 def descend(qubo: Qubo, x: Array) -> None:

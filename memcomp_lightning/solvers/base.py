@@ -26,7 +26,10 @@ class Status(IntEnum):
     OPTIMAL = 0, "Proven: no state has a lower energy."
     CONVERGED = 1, "No block of variables improves this assignment; more restarts may find a lower one."
     STEP_BUDGET = 2, "The best assignment came long before the last step; more restarts may find a lower one."
-    STILL_IMPROVING = 3, "The best assignment came in the last tenth of the steps: more steps may find a lower one."
+    STILL_IMPROVING = (
+        3,
+        "The best assignment came in the last tenth of the steps: more steps may find a lower one.",
+    )
     NOT_RUN = 4, "Not run: enough restarts before it had found nothing better, or no time was left."
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."

@@ -60,6 +60,9 @@ def anneal_layers(first_item, last_item, stop, problem, betas, quench, threshold
         for i in range(n_second):
             if x[n_first + i] > F32(0):
                 field[:n_first] += by_second[i]
+        if (item - p * n_restarts) % 2 == 0:  # see random_states
+            n = _settle(x[n_first:], field[n_first:], flipped)
+            _add_rows(field[:n_first], by_second, flipped, n, x[n_first:])
         lowest, n_sweeps = F32(np.inf), betas.shape[1]
         for sweep in range(n_sweeps):
             beta = betas[p, sweep]
