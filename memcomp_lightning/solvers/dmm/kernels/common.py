@@ -43,8 +43,14 @@ TINY: Final = np.float32(1e-30)
 FAST_MATH: Final = {"reassoc", "contract", "nsz", "arcp", "nnan", "ninf"}
 """Sums may be reordered, which vector code needs; nothing may be NaN or infinite (nnan, ninf)."""
 
+inlined: Final = njit(
+    nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True, _nrt=False
+)
+"""Makes what kernels call a part of them. It allocates nothing and, by ``_nrt``, counts no references to arrays:
+each is an atomic operation, and thousands of them a step cost more than the arithmetic of a small problem."""
 
-@njit(nogil=True, cache=True, inline="always")
+
+@inlined
 def uniform(seed, counter):
     """A number in [-1, 1) that depends on nothing but its arguments: a hash of both (Murmur3's finaliser)."""
     z = (seed + counter * np.uint64(0x9E3779B9)) & np.uint64(0xFFFFFFFF)
@@ -54,7 +60,7 @@ def uniform(seed, counter):
     return F32(z >> np.uint64(8)) * F32(2.0**-23) - F32(1)
 
 
-@njit(nogil=True, inline="always", fastmath=FAST_MATH)
+@inlined
 def clause_rates(c, dt):
     """What ``clause`` needs of the constants and the step: growth, keep, rise, fall, epsilon, top, cap."""
     alpha, beta, gamma, delta, epsilon, one = c[ALPHA], c[BETA], c[GAMMA], c[DELTA], c[EPSILON], F32(1)
@@ -62,7 +68,7 @@ def clause_rates(c, dt):
     return dt * beta, one - dt * beta * gamma, dt * alpha, -dt * alpha * delta, epsilon, one + epsilon, cap
 
 
-@njit(nogil=True, inline="always", fastmath=FAST_MATH)
+@inlined
 def clause(weight, voltage, false_second, short, long, rates):
     """Advance the memories of one clause of two literals; ``ClauseField`` has the equations.
 

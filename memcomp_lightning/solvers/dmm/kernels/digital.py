@@ -6,9 +6,8 @@ and longer clauses (``lanes``), restart by restart.
 """
 
 import numpy as np
-from numba import njit
 
-from memcomp_lightning.solvers.dmm.kernels.common import F32, FAST_MATH
+from memcomp_lightning.solvers.dmm.kernels.common import F32, inlined
 
 U64 = np.uint64
 
@@ -22,14 +21,14 @@ MANY = 3
 """Where more than one bit in so many changes, writing all fields anew is faster than flip after flip."""
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@inlined
 def copy(source, target):
     """Copy numbers one by one: assigning a slice takes seconds to compile, for numba's error message alone."""
     for i in range(source.size):
         target[i] = source[i]
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@inlined
 def keep_if_new(x, best):
     """Copy a state; return whether it differs."""
     new = False
@@ -39,7 +38,7 @@ def keep_if_new(x, best):
     return new
 
 
-@njit(nogil=True, cache=True, forceinline=True)
+@inlined
 def keep_better(energy, lowest, x, best, step, found_at):
     """Copy a state to ``best`` if its energy is lower; return the lowest energy, and the step that found it."""
     if energy < lowest:
@@ -49,7 +48,7 @@ def keep_better(energy, lowest, x, best, step, found_at):
     return lowest, found_at
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def flip_matrix(n_first, n_second, coupling, transposed, x, field, i):
     """Flip one variable; return the change of energy."""
     change = F32(1) - F32(2) * x[i]
@@ -66,7 +65,7 @@ def flip_matrix(n_first, n_second, coupling, transposed, x, field, i):
     return gain
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def local_fields_matrix(n_first, n_second, coupling, linear, x, field):
     """Write the local fields of a digital state from scratch; return its energy."""
     energy, row = 0.0, U64(0)
@@ -84,7 +83,7 @@ def local_fields_matrix(n_first, n_second, coupling, linear, x, field):
     return energy
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def quench_matrix(n_first, n_second, coupling, transposed, x, field, found):
     """Flip single variables, layer by layer, as long as each flip lowers the energy; return the change.
 
@@ -110,7 +109,7 @@ def quench_matrix(n_first, n_second, coupling, transposed, x, field, found):
     return total
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def read_out_matrix(n_first, n_second, coupling, transposed, linear, voltage, x, field, energy, found):
     """Bring the digital state and its fields up to the voltages; return its energy and how many bits changed."""
     half, n, n_changed = F32(0.5), n_first + n_second, 0
@@ -130,7 +129,7 @@ def read_out_matrix(n_first, n_second, coupling, transposed, linear, voltage, x,
     return energy, n_changed
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def flip_listed(digital, x, field, true, i):
     """Flip variable ``i`` of one restart; return the change of energy.
 
@@ -164,7 +163,7 @@ def flip_listed(digital, x, field, true, i):
     return gain
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+@inlined
 def local_fields_listed(digital, linear, pairs, x, field, true):
     """Write the local fields of one restart from scratch; return its energy."""
     coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
@@ -193,7 +192,7 @@ def local_fields_listed(digital, linear, pairs, x, field, true):
     return energy
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def quench_listed(digital, x, field, true):
     """Flip single variables of one restart as long as each flip lowers the energy; return the change."""
     one, two, total = F32(1), F32(2), 0.0
@@ -210,7 +209,7 @@ def quench_listed(digital, x, field, true):
     return total
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def read_out_listed(digital, signs, x, field, true, found):
     """Bring one restart up to its voltages' signs; return the change of energy and how many bits changed."""
     change, n_found = 0.0, U64(0)
@@ -222,7 +221,7 @@ def read_out_listed(digital, signs, x, field, true, found):
     return change, n_found
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+@inlined
 def transpose_signs(voltage, signs):
     """Write 1 for TRUE and 0 for FALSE, restart by restart, from voltages with the restarts last."""
     n, lanes = voltage.shape

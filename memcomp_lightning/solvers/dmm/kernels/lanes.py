@@ -39,6 +39,7 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     ZETA,
     clause,
     clause_rates,
+    inlined,
     uniform,
 )
 from memcomp_lightning.solvers.dmm.kernels.digital import (
@@ -167,7 +168,7 @@ def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
                     r[a + k] += q * (at_first if at[k] == number else gradient[k] * smallest[k])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def clause_units(unit, long, voltage, rate, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
@@ -182,7 +183,7 @@ def clause_units(unit, long, voltage, rate, c, dt):
             rate[i, 0, k] += strength * u * (one + long[i, k])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def bond_fields(field, short, long, voltage, rate, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
@@ -202,7 +203,7 @@ def bond_fields(field, short, long, voltage, rate, c, dt):
             rate[i, 0, k] = alpha * (rate[i, 0, k] + h) - pull_rate * pull * voltage[i, k]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def clause_start(problem, memories, voltage, c):
     """Short-term memories begin at x_s(0) = C(0): how far each clause is from being satisfied."""
     _, pairs, _, polarity, _, (variables, longer_polarity, _) = problem
@@ -234,7 +235,7 @@ def clause_advance(problem, memories, voltage, rate, scratch, c, dt):
     longer_pass(longer, longer_memory, voltage, rate, falsehood, numbers, c, dt)
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def bond_start(problem, memories, voltage, c):
     """All short-term memories begin at ``short_term_start``."""
     memory, unit_short, _, _ = memories

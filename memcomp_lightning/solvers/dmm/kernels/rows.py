@@ -37,6 +37,7 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     ZETA,
     clause,
     clause_rates,
+    inlined,
     uniform,
 )
 from memcomp_lightning.solvers.dmm.kernels.digital import (
@@ -51,7 +52,7 @@ from memcomp_lightning.solvers.dmm.kernels.digital import (
 U64 = np.uint64
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+@inlined
 def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c, dt):
     """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive.
 
@@ -76,7 +77,7 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def clause_units(unit, long, voltage, drive, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
     half, one = F32(0.5), F32(1)
@@ -90,7 +91,7 @@ def clause_units(unit, long, voltage, drive, c, dt):
         drive[i] += pull * u * (one + long[i])
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
+@inlined
 def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt):
     """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
 
@@ -137,7 +138,7 @@ def bond_pass(n_first, n_second, bond, short, long, voltage, drive, pull, c, dt)
         row += n_first
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def bond_fields(field, short, long, voltage, drive, pull, c, dt):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     zero, one = F32(0), F32(1)
@@ -153,7 +154,7 @@ def bond_fields(field, short, long, voltage, drive, pull, c, dt):
         drive[i] = alpha * (drive[i] + h) - pull_rate * (pull[i] + abs(h) * short[i]) * voltage[i]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@inlined
 def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
     """Write x_s(0) + epsilon = C(0) + epsilon."""
     half, row = F32(0.5), U64(0)
