@@ -1,6 +1,5 @@
 """What the compiled kernels share: constants, step size, noise, the motion of the voltages."""
 
-import math
 from typing import Final
 
 import numpy as np
@@ -69,23 +68,21 @@ def clause_rates(c, dt):
 
 
 @inlined
-def clause(weight, voltage, false_second, short, long, rates):
+def clause(false_first, false_second, short, long, rates):
     """Advance the memories of one clause of two literals; ``ClauseField`` has the equations.
 
     Args:
-        weight: With the polarity of the first literal as its sign.
-        voltage: Of the first literal's variable.
-        false_second: How false the second literal is.
+        false_first: How false the first literal is.
+        false_second: How false the second one is.
         short: x_s + epsilon.
         long: x_l - 1.
         rates: See ``clause_rates``.
 
     Returns:
-        Both memories, the push on the first variable, and the push on the second over its polarity.
+        Both memories, and the push on each literal over the weight of the clause.
     """
     growth, keep, rise, fall, epsilon, top, cap = rates
-    zero, half, one = F32(0), F32(0.5), F32(1)
-    false_first = half - math.copysign(half, weight) * voltage
+    zero, one = F32(0), F32(1)
     unsatisfied = min(false_first, false_second)
     short = min(top, max(epsilon, short * (keep + growth * unsatisfied)))
     excess = fall + rise * unsatisfied
@@ -94,6 +91,4 @@ def clause(weight, voltage, false_second, short, long, rates):
     gradient = agile + agile * long
     rigidity = unsatisfied - agile * unsatisfied
     at_first = rigidity if false_first <= false_second else zero
-    first = weight * (gradient * false_second + at_first)
-    second = abs(weight) * (gradient * false_first + (rigidity - at_first))
-    return short, long, first, second
+    return short, long, gradient * false_second + at_first, gradient * false_first + (rigidity - at_first)

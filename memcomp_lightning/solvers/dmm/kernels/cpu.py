@@ -58,7 +58,7 @@ def run(
     in_rows = isinstance(field, ClauseField | BondField)
     if in_rows and isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
         return _run_rows(field, integrator, problem, problem.graph, start, steps, remember)
-    return _run_lanes(field, integrator, problem, start, steps)
+    return _run_lanes(field, integrator, problem, start, steps, remember)
 
 
 def _run_rows(
@@ -148,7 +148,12 @@ def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
 
 
 def _run_lanes(
-    field: Any, integrator: Splitting, problem: Qubo | WeightedMaxSat, start: Start, steps: Steps
+    field: Any,
+    integrator: Splitting,
+    problem: Qubo | WeightedMaxSat,
+    start: Start,
+    steps: Steps,
+    remember: bool,
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     passes, machine = FIELDS[type(field)], field.build(problem)
@@ -159,13 +164,15 @@ def _run_lanes(
     sparse = _sparse(passes.listed(machine), problem, n_problems)
     voltage = _to_lanes(float32(start.voltage), n_blocks, lanes_each)
     sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
-    kept = [float32(memory) for memory in start.kept]
-    kept = kept or [np.zeros((n_problems, n_restarts, size), np.float32) for size in sizes]
-    memories = [_to_lanes(memory, n_blocks, lanes_each) for memory in kept]
+    if start.kept:
+        memories = [_to_lanes(float32(memory), n_blocks, lanes_each) for memory in start.kept]
+    else:
+        memories = [np.zeros((n_problems, n_blocks * remember, size, lanes_each), np.float32) for size in sizes]
     seed = np.ascontiguousarray(
         _to_lanes(to_numpy(start.seed).astype(np.uint64)[..., None], n_blocks, lanes_each)[:, :, 0]
     )
-    out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
+    best, *out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
+    best = np.zeros((n_problems, n_blocks, n, lanes_each), np.float32)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
     own = (passes.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
     arrays = (*own, longer, sparse.digital, sparse.linear)
@@ -173,10 +180,10 @@ def _run_lanes(
     work = (sparse.weight.size + sparse.longer_weight.size) * n_restarts * steps[0]
     ours = type(passes.kind).__module__.startswith("memcomp_lightning.")
     kernel = lanes.integrate_all if ours else _of_this_process()
-    share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, *out), _INLINED)
-    out = tuple(x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out)
-    final = [_from_lanes(x, n_restarts) for x in (voltage, *memories)]
-    return _finish(out, final[0], final[1:], steps, start.voltage)
+    share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, best, *out), _INLINED)
+    out = [x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out]
+    best, final, *kept = (_from_lanes(x, n_restarts) for x in (best, voltage, *(memories if remember else ())))
+    return _finish((best, *out), final, kept, steps, start.voltage)
 
 
 @cache
@@ -224,10 +231,10 @@ def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> 
     neighbours = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
     literal_clause, literal_at = np.nonzero(longer_polarity)
     clause_order, clause_offsets = grouped(variables[literal_clause, literal_at], n)
-    of_pairs = (offsets, neighbours, order % max(n_pairs, 1), coupling)
+    of_pairs = (offsets, neighbours.astype(np.int32), np.ascontiguousarray(np.tile(coupling, 2)[:, order]))
     of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
     return _Sparse(
-        pairs,
+        pairs.astype(np.int32),
         float32(listed.weight.reshape(n_problems, n_pairs)),
         polarity,
         float32(listed.unit.reshape(n_problems, n)),
@@ -277,19 +284,13 @@ def _finish(out: tuple[Numbers, ...], voltage: Numbers, memories: list[Numbers],
 
 
 def _blocks(n_restarts: int) -> tuple[int, int]:
-    """Number of blocks of restarts and lanes of each, a multiple of ``_LANES`` up to ``_MOST_LANES``."""
-    n_blocks = -(-n_restarts // _MOST_LANES)
-    return n_blocks, -(-n_restarts // (n_blocks * _LANES)) * _LANES
+    """Number of blocks of restarts and lanes of each: 4, 8 or 16."""
+    lanes_each = next((few for few in (4, 8) if n_restarts <= few), 16)
+    return -(-n_restarts // lanes_each), lanes_each
 
 
 _VECTOR = 8
 """float32 numbers in a vector register; layers are padded to a multiple."""
-
-_LANES = 16
-"""Blocks of restarts are padded to a multiple."""
-
-_MOST_LANES = 32
-"""Enough to hide the cost of a loop over the lanes, few enough to keep a variable's numbers close together."""
 
 
 def _to_lanes(x: Numbers, n_blocks: int, lanes_each: int) -> Numbers:

@@ -1,8 +1,8 @@
 """The digital state beside the voltages: reading it out, its energy and local fields, the descent from it.
 
 A state ``x`` has its local fields, the change of energy with each bit; every flip keeps them up to date. Functions
-are there for two layouts: ``..._matrix`` for two fully coupled layers (``rows``), ``..._listed`` for listed pairs
-and longer clauses (``lanes``), restart by restart.
+are there for two layouts: ``..._matrix`` for two fully coupled layers (``rows``), restart by restart;
+``..._listed`` for listed pairs and longer clauses (``lanes``), in all lanes side by side.
 """
 
 import numpy as np
@@ -130,102 +130,141 @@ def read_out_matrix(n_first, n_second, coupling, transposed, linear, voltage, x,
 
 
 @inlined
-def flip_listed(digital, x, field, true, i):
-    """Flip variable ``i`` of one restart; return the change of energy.
-
-    The digital states lie restart by restart, one number a variable: ``x`` and ``field`` of a restart stay close
-    together. ``true`` counts the true literals of each longer clause.
-    """
-    start, neighbour, edge, coupling, in_clause, clause_of, variables, polarity, weight = digital
-    half, one = F32(0.5), F32(1)
-    change = one - F32(2) * x[i]
-    gain = change * field[i]
-    x[i] += change
-    for at in range(start[i], start[i + 1]):
-        field[neighbour[at]] += change * coupling[edge[at]]
-    for at in range(in_clause[i], in_clause[i + 1]):
-        clause_at = clause_of[at]
-        before = true[clause_at]
-        after = before
-        for j in range(variables.shape[1]):
-            if variables[clause_at, j] == i and polarity[clause_at, j] != 0:
-                after += 1 if (polarity[clause_at, j] > 0) == (x[i] > half) else -1
-        true[clause_at] = after
-        for j in range(variables.shape[1]):
-            other, sign = variables[clause_at, j], polarity[clause_at, j]
-            if sign == 0 or other == i:
-                continue
-            holds = 1 if (sign > 0) == (x[other] > half) else 0
-            # A literal decides its clause where no other one is true.
-            was, now = before == holds, after == holds
-            if was != now:
-                field[other] += (-sign if now else sign) * weight[clause_at]
-    return gain
-
-
-@inlined
-def local_fields_listed(digital, linear, pairs, x, field, true):
-    """Write the local fields of one restart from scratch; return its energy."""
-    coupling, variables, polarity, weight = digital[3], digital[6], digital[7], digital[8]
-    half, energy = F32(0.5), 0.0
-    copy(linear, field)
-    for e in range(coupling.size):
-        field[pairs[e, 0]] += coupling[e] * x[pairs[e, 1]]
-        field[pairs[e, 1]] += coupling[e] * x[pairs[e, 0]]
-    for i in range(linear.size):
-        energy += half * x[i] * (linear[i] + field[i])
-    for at in range(weight.size):
-        count = 0
-        for j in range(variables.shape[1]):
-            sign = polarity[at, j]
-            if sign != 0 and (sign > 0) == (x[variables[at, j]] > half):
-                count += 1
-        true[at] = count
-        if count == 0:
-            energy += weight[at]
-        for j in range(variables.shape[1]):
-            sign = polarity[at, j]
-            if sign != 0:
-                holds = 1 if (sign > 0) == (x[variables[at, j]] > half) else 0
-                if count == holds:
-                    field[variables[at, j]] -= sign * weight[at]
-    return energy
-
-
-@inlined
-def quench_listed(digital, x, field, true):
-    """Flip single variables of one restart as long as each flip lowers the energy; return the change."""
-    one, two, total = F32(1), F32(2), 0.0
-    for _ in range(MAX_SWEEPS):
-        # A vector loop finds out whether anything moves; the sweep itself goes one by one.
-        n_eager = 0
-        for i in range(x.size):
-            n_eager += 1 if (one - two * x[i]) * field[i] < 0 else 0
-        if n_eager == 0:
-            break
-        for i in range(x.size):
-            if (one - two * x[i]) * field[i] < 0:
-                total += flip_listed(digital, x, field, true, i)
-    return total
-
-
-@inlined
-def read_out_listed(digital, signs, x, field, true, found):
-    """Bring one restart up to its voltages' signs; return the change of energy and how many bits changed."""
-    change, n_found = 0.0, U64(0)
-    for i in range(U64(x.size)):
-        found[n_found] = i
-        n_found += U64(1) if signs[i] != x[i] else U64(0)
-    for m in range(n_found):
-        change += flip_listed(digital, x, field, true, found[m])
-    return change, n_found
-
-
-@inlined
-def transpose_signs(voltage, signs):
-    """Write 1 for TRUE and 0 for FALSE, restart by restart, from voltages with the restarts last."""
-    n, lanes = voltage.shape
-    for first in range(0, n, 16):
+def add(lanes, rows, to, factor, row, at):
+    """Add ``factor`` times a row of numbers, one a lane, to another row."""
+    if lanes == U64(4):
+        # Written out: the compiler makes no vector of four numbers that it must first prove to be apart.
+        one, two, three = U64(1), U64(2), U64(3)
+        first, second = rows[to] + factor * row[at], rows[to + one] + factor * row[at + one]
+        third, fourth = rows[to + two] + factor * row[at + two], rows[to + three] + factor * row[at + three]
+        rows[to], rows[to + one], rows[to + two], rows[to + three] = first, second, third, fourth
+    else:
         for k in range(lanes):
-            for i in range(first, min(first + 16, n)):
-                signs[k, i] = F32(1) if voltage[i, k] > 0 else F32(0)
+            rows[to + k] += factor * row[at + k]
+
+
+@inlined
+def flip_listed(lanes, digital, x, field, true, i, change):
+    """Change variable ``i`` by -1, 0 or 1 in each lane.
+
+    ``x`` and ``field`` are flat, the lanes of a variable side by side. ``true`` counts the true literals of each
+    longer clause.
+    """
+    start, neighbour, coupling, in_clause, clause_of, variables, polarity, weight = digital
+    half, one, zero = F32(0.5), F32(1), F32(0)
+    for at in range(start[i], start[i + 1]):
+        add(lanes, field, U64(neighbour[at]) * lanes, coupling[at], change, U64(0))
+    add(lanes, x, U64(i) * lanes, one, change, U64(0))
+    for at in range(in_clause[i], in_clause[i + 1]):
+        e, own = clause_of[at], zero
+        row = U64(e) * lanes
+        for j in range(variables.shape[1]):
+            own += polarity[e, j] if variables[e, j] == i else zero
+        for j in range(variables.shape[1]):
+            sign, to = polarity[e, j], U64(variables[e, j]) * lanes
+            if sign == zero or variables[e, j] == i:
+                continue
+            for k in range(lanes):
+                # A literal decides its clause where no other one is true.
+                holds, before = half + sign * (x[to + k] - half), true[row + k]
+                was = weight[e] if before == holds else zero
+                now = weight[e] if before + own * change[k] == holds else zero
+                field[to + k] += sign * (was - now)
+        add(lanes, true, row, own, change, U64(0))
+
+
+@inlined
+def local_fields_listed(lanes, digital, linear, x, field, true, energy):
+    """Write the local fields and energies of all lanes from scratch."""
+    start, neighbour, coupling, _, _, variables, polarity, weight = digital
+    half, zero, row = F32(0.5), F32(0), U64(0)
+    for k in range(lanes):
+        energy[k] = 0.0
+    for i in range(linear.size):
+        for k in range(lanes):
+            field[row + k] = linear[i]
+        for at in range(start[i], start[i + 1]):
+            add(lanes, field, row, coupling[at], x, U64(neighbour[at]) * lanes)
+        for k in range(lanes):
+            energy[k] += half * x[row + k] * (linear[i] + field[row + k])
+        row += lanes
+    row = U64(0)
+    for e in range(weight.size):
+        for k in range(lanes):
+            true[row + k] = zero
+        for j in range(variables.shape[1]):
+            sign, at = polarity[e, j], U64(variables[e, j]) * lanes
+            for k in range(lanes):
+                true[row + k] += half * abs(sign) + sign * (x[at + k] - half)
+        for k in range(lanes):
+            energy[k] += weight[e] if true[row + k] == zero else zero
+        for j in range(variables.shape[1]):
+            sign, at = polarity[e, j], U64(variables[e, j]) * lanes
+            for k in range(lanes):
+                decides = true[row + k] == half + sign * (x[at + k] - half)
+                field[at + k] -= sign * weight[e] if decides else zero
+        row += lanes
+
+
+@inlined
+def read_out_listed(lanes, digital, voltage, x, field, true, energy, changed, change):
+    """Bring all lanes up to the signs of their voltages; ``changed`` becomes 1 where any bit did."""
+    one, zero, row = F32(1), F32(0), U64(0)
+    for i in range(U64(x.size) // lanes):
+        some = zero
+        for k in range(lanes):
+            change[k] = (one if voltage[row + k] > zero else zero) - x[row + k]
+        for k in range(lanes):
+            some += abs(change[k])
+        if some > zero:
+            for k in range(lanes):
+                energy[k] += change[k] * field[row + k]
+            for k in range(lanes):
+                changed[k] = max(changed[k], abs(change[k]))
+            flip_listed(lanes, digital, x, field, true, i, change)
+        row += lanes
+
+
+@inlined
+def quench_listed(lanes, digital, x, field, true, energy, changed, change):
+    """Flip single variables of the lanes that changed, as long as each flip lowers the energy."""
+    one, two, zero = F32(1), F32(2), F32(0)
+    for _ in range(MAX_SWEEPS):
+        n_flips, row = zero, U64(0)
+        for i in range(U64(x.size) // lanes):
+            some = zero
+            for k in range(lanes):
+                flip = one - two * x[row + k]
+                change[k] = flip * changed[k] if flip * field[row + k] < zero else zero
+            for k in range(lanes):
+                some += abs(change[k])
+            if some > zero:
+                n_flips += some
+                for k in range(lanes):
+                    energy[k] += change[k] * field[row + k]
+                flip_listed(lanes, digital, x, field, true, i, change)
+            row += lanes
+        if n_flips == zero:
+            break
+
+
+@inlined
+def keep_better_listed(lanes, energy, lowest, x, best, step, found_at, better, new):
+    """Copy the states whose energies are lower than any before; note the step that met them first."""
+    one, zero, some, row = F32(1), F32(0), F32(0), U64(0)
+    for k in range(lanes):
+        new[k], better[k] = zero, one if energy[k] < lowest[k] else zero
+        some += better[k]
+    if some == zero:
+        return
+    for _ in range(U64(x.size) // lanes):
+        for k in range(lanes):
+            new[k] += better[k] * abs(x[row + k] - best[row + k])
+        for k in range(lanes):
+            best[row + k] += better[k] * (x[row + k] - best[row + k])
+        row += lanes
+    for k in range(lanes):
+        if better[k] > zero:
+            lowest[k] = energy[k]
+            if new[k] > zero or step == 0:
+                found_at[k] = step

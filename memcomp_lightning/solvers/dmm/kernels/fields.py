@@ -34,8 +34,8 @@ class Compiled(NamedTuple):
 
     * ``problem``: (kind, pairs, weight, polarity, unit, longer): the variables of each pair, ``(n_pairs, 2)``, and
       the numbers of :class:`Listed`;
-    * ``memories``: of pairs, short- and long-term, ``(n_pairs, 2, lanes)``; short- and long-term ones of units,
-      ``(n, lanes)`` each; of longer clauses, ``(n_longer, 2, lanes)``. The long-term ones, less 1, are set;
+    * ``memories``: of pairs, short- and long-term, ``(2, n_pairs, lanes)``; short- and long-term ones of units,
+      ``(n, lanes)`` each; of longer clauses, ``(2, n_longer, lanes)``. Long-term ones, less 1, are set;
     * ``voltage``, ``(n, lanes)``, and ``c``, the row of constants.
 
     Attributes:
@@ -45,8 +45,8 @@ class Compiled(NamedTuple):
         of_problem: From field and machine to the settings that differ from problem to problem, ``(n_problems,)``.
         start: ``start(problem, memories, voltage, c)`` writes the short-term memories.
         advance: ``advance(problem, memories, voltage, rate, scratch, c, dt)`` moves the memories by ``dt``, one
-            number a lane, at the present voltages, and adds the rate of the voltages to ``rate[:, 0]``, where
-            ``rate`` has the shape ``(n, 2, lanes)``.
+            number a lane, at the present voltages, and adds the rate of the voltages to ``rate[0]``, where ``rate``
+            has the shape ``(2, n, lanes)``; ``rate[1]`` is scratch, at first 0.
         obstacle: Why some settings of the field have no compiled passes, and what to do; None if these have.
     """
 

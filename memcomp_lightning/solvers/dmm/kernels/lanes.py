@@ -1,12 +1,13 @@
 """Compiled kernel for listed pairs and longer clauses: vectors run along the restarts.
 
-One call integrates a block of restarts, its lanes, side by side, so that a sparse problem needs no gathers: every
-number of a variable or a clause is a vector over the restarts. Time and memory are linear in the number of
-pairs. All arrays are float32 with the lanes last; each lane has a step size of its own. The equations are those
-of ``ClauseField`` and ``BondField``, the scheme is ``Splitting``.
+One call integrates a block of 4, 8 or 16 restarts, its lanes, side by side: every number of a variable or a clause
+is a row, one number a lane. Time and memory are linear in the number of pairs. All arrays are float32 with the
+lanes last; each lane has a step size of its own. The equations are those of ``ClauseField`` and ``BondField``, the
+scheme is ``Splitting``.
 
-The passes over the pairs read flat arrays at unsigned offsets, in loops over the lanes that write one array
-each: only then does the compiler make vector code of them.
+A pass takes the pairs in chunks of ``ROWS``: it gathers the rows of their variables, moves the memories in one
+long loop over flat arrays, and adds the pushes to the rows of the variables. Only such loops become vector code:
+in one over a single pair the compiler would have to make sure that no two rows overlap, pair by pair.
 """
 
 import math
@@ -44,12 +45,12 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
 )
 from memcomp_lightning.solvers.dmm.kernels.digital import (
     REFRESH,
+    add,
     copy,
-    keep_better,
+    keep_better_listed,
     local_fields_listed,
     quench_listed,
     read_out_listed,
-    transpose_signs,
 )
 
 if TYPE_CHECKING:
@@ -57,66 +58,72 @@ if TYPE_CHECKING:
 
 U64 = np.uint64
 
+ROWS = 64
+"""Pairs or variables in a chunk: enough to hide the cost of a loop, few enough to stay close to the processor."""
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
-def clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt):
-    """Advance the memories of all pairs by ``dt`` at the present voltages, then add the pairs' drive to ``rate``.
 
-    ``memory`` holds x_s + epsilon and x_l - 1 of each pair, ``(n_pairs, 2, lanes)``; ``push`` is scratch.
-    """
-    half, lanes = F32(0.5), U64(dt.size)
-    m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
-    for e in range(weight.size):
-        w, second = math.copysign(weight[e], polarity[e, 0]), polarity[e, 1]
-        a, b, short = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, U64(2 * e) * lanes
-        long = short + lanes
+@inlined
+def gather(lanes, row, to, offset, factor, voltage, at):
+    """Write ``offset`` plus ``factor`` times a row of voltages."""
+    if lanes == U64(4):  # as in ``add``
+        one, two, three = U64(1), U64(2), U64(3)
+        first, second = offset + factor * voltage[at], offset + factor * voltage[at + one]
+        third, fourth = offset + factor * voltage[at + two], offset + factor * voltage[at + three]
+        row[to], row[to + one], row[to + two], row[to + three] = first, second, third, fourth
+    else:
         for k in range(lanes):
-            m[short + k], m[long + k], at_first, at_second = clause(
-                w, v[a + k], half - half * second * v[b + k], m[short + k], m[long + k], clause_rates(c, dt[k])
+            row[to + k] = offset + factor * voltage[at + k]
+
+
+@inlined
+def clause_pass(lanes, pairs, weight, polarity, short, long, voltage, rate, buffers, c):
+    """Advance the memories of all pairs at the present voltages, then add the pairs' drive to ``rate``."""
+    dt, first, second = buffers
+    half, zero = F32(0.5), U64(0)
+    for begin in range(zero, U64(weight.size), U64(ROWS)):
+        end, to, at = min(begin + U64(ROWS), U64(weight.size)), zero, begin * lanes
+        for e in range(begin, end):
+            gather(lanes, first, to, half, -half * polarity[e, 0], voltage, U64(pairs[e, 0]) * lanes)
+            gather(lanes, second, to, half, -half * polarity[e, 1], voltage, U64(pairs[e, 1]) * lanes)
+            to += lanes
+        for x in range(to):
+            short[at + x], long[at + x], first[x], second[x] = clause(
+                first[x], second[x], short[at + x], long[at + x], clause_rates(c, dt[x])
             )
-            push[k] = at_first
-            push[lanes + k] = second * at_second
-        a, b = a + a, b + b
-        for k in range(lanes):
-            r[a + k] += push[k]
-        for k in range(lanes):
-            r[b + k] += push[lanes + k]
+        to = zero
+        for e in range(begin, end):
+            add(lanes, rate, U64(pairs[e, 0]) * lanes, weight[e] * polarity[e, 0], first, to)
+            add(lanes, rate, U64(pairs[e, 1]) * lanes, weight[e] * polarity[e, 1], second, to)
+            to += lanes
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
-def bond_pass(pairs, bond, memory, voltage, rate, push, c, dt):
-    """Advance the memories of all bonds by ``dt`` at the present voltages, then add their drive and pull.
-
-    ``memory`` holds X and Y - 1 of each bond, ``rate`` the drive and the pull of each spin, ``(..., 2, lanes)``.
-    """
-    zero, one = F32(0), F32(1)
-    gamma, kappa, delta, zeta = c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
+@inlined
+def bond_pass(lanes, pairs, bond, short, long, voltage, drive, pull, buffers, c):
+    """Advance the memories of all bonds at the present voltages, then add their drive and pull."""
+    dt, first, second = buffers
+    none, zero, one = U64(0), F32(0), F32(1)
+    gamma, delta, zeta = c[GAMMA], c[DELTA], c[ZETA]
     low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
-    lift = gamma - one
-    lanes = U64(dt.size)
-    m, v, r = memory.ravel(), voltage.ravel(), rate.ravel()
-    for e in range(bond.size):
-        w = bond[e]
-        size = abs(w)
-        satisfied = gamma * kappa * (one if w > zero else (-one if w < zero else zero))
-        a, b, short = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, U64(2 * e) * lanes
-        long = short + lanes
-        for k in range(lanes):
-            x, y = m[short + k], m[long + k]
-            m[long + k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
-            x = min(one, max(low, x + dt[k] * (lift - y + satisfied * (v[a + k] * v[b + k]))))
-            m[short + k] = x
-            push[k] = size * x
-        drive_a, drive_b = a + a, b + b
-        for k in range(lanes):
-            r[drive_a + k] += w * v[b + k]
-        for k in range(lanes):
-            r[drive_b + k] += w * v[a + k]
-        pull_a, pull_b = drive_a + lanes, drive_b + lanes
-        for k in range(lanes):
-            r[pull_a + k] += push[k]
-        for k in range(lanes):
-            r[pull_b + k] += push[k]
+    lift, satisfied = gamma - one, gamma * c[KAPPA]
+    for begin in range(none, U64(bond.size), U64(ROWS)):
+        end, to, at = min(begin + U64(ROWS), U64(bond.size)), none, begin * lanes
+        for e in range(begin, end):
+            sign = one if bond[e] > zero else (-one if bond[e] < zero else zero)
+            gather(lanes, first, to, zero, sign, voltage, U64(pairs[e, 0]) * lanes)
+            gather(lanes, second, to, zero, one, voltage, U64(pairs[e, 1]) * lanes)
+            to += lanes
+        for x in range(to):
+            before, y = short[at + x], long[at + x]
+            long[at + x] = min(cap, max(zero, y + dt[x] * (delta * before - zeta)))
+            short[at + x] = min(one, max(low, before + dt[x] * (lift - y + satisfied * (first[x] * second[x]))))
+        to = none
+        for e in range(begin, end):
+            a, b, size = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, abs(bond[e])
+            add(lanes, drive, a, bond[e], second, to)
+            add(lanes, drive, b, size, first, to)
+            add(lanes, pull, a, size, short, at + to)
+            add(lanes, pull, b, size, short, at + to)
+            to += lanes
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, error_model="numpy", forceinline=True)
@@ -133,8 +140,8 @@ def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
     m, v, r, f = memory.ravel(), voltage.ravel(), rate.ravel(), falsehood.ravel()
     smallest, next_smallest, at, gradient, rigidity = scratch
     for e in range(weight.size):
-        w, short = weight[e], U64(2 * e) * lanes
-        long = short + lanes
+        w, short = weight[e], U64(e) * lanes
+        long = U64(weight.size) * lanes + short
         smallest[:] = one + one
         next_smallest[:] = one + one
         for i in range(variables.shape[1]):
@@ -162,45 +169,58 @@ def longer_pass(longer, memory, voltage, rate, falsehood, scratch, c, dt):
         for i in range(variables.shape[1]):
             q = polarity[e, i]
             if q != 0:
-                a, number = U64(2 * variables[e, i]) * lanes, F32(i)
+                a, number = U64(variables[e, i]) * lanes, F32(i)
                 for k in range(lanes):
                     at_first = gradient[k] * next_smallest[k] + rigidity[k]
                     r[a + k] += q * (at_first if at[k] == number else gradient[k] * smallest[k])
 
 
 @inlined
-def clause_units(unit, long, voltage, rate, c, dt):
-    """Advance the memories of the unit clauses and add their pull."""
-    half, one = F32(0.5), F32(1)
-    alpha, delta, cap, strength = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
-    for i in range(unit.size):
-        u = unit[i]
-        sign = half if u > 0 else (-half if u < 0 else F32(0))
-        for k in range(dt.size):
-            excess = dt[k] * alpha * (half - sign * voltage[i, k] - delta)
-            long[i, k] = min(cap, max(F32(0), long[i, k] + excess * (one if excess > 0 else long[i, k])))
-        for k in range(dt.size):
-            rate[i, 0, k] += strength * u * (one + long[i, k])
+def spread_out(lanes, values, begin, row):
+    """Write a chunk of numbers, one a variable, once for each lane; return how many."""
+    to = U64(0)
+    for i in range(begin, min(begin + U64(ROWS), U64(values.size))):
+        for k in range(lanes):
+            row[to + k] = values[i]
+        to += lanes
+    return to
 
 
 @inlined
-def bond_fields(field, short, long, voltage, rate, c, dt):
+def clause_units(lanes, unit, long, voltage, rate, buffers, c):
+    """Advance the memories of the unit clauses and add their pull."""
+    dt, own, _ = buffers
+    half, one, zero = F32(0.5), F32(1), F32(0)
+    alpha, delta, cap, strength = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
+    for begin in range(U64(0), U64(unit.size), U64(ROWS)):
+        size, at = spread_out(lanes, unit, begin, own), begin * lanes
+        for x in range(size):
+            sign = half if own[x] > zero else (-half if own[x] < zero else zero)
+            excess = dt[x] * alpha * (half - sign * voltage[at + x] - delta)
+            y = long[at + x]
+            y = min(cap, max(zero, y + excess * (one if excess > zero else y)))
+            long[at + x] = y
+            rate[at + x] += strength * own[x] * (one + y)
+
+
+@inlined
+def bond_fields(lanes, field, short, long, voltage, drive, pull, buffers, c):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
+    dt, own, _ = buffers
     zero, one = F32(0), F32(1)
     alpha, gamma, kappa, delta, zeta = c[ALPHA], c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
     low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
     pull_rate = F32(2) * c[BETA] / c[PULL_SCALE]
-    for i in range(field.size):
-        h = field[i]
-        size = abs(h)
-        sign = one if h > zero else (-one if h < zero else zero)
-        for k in range(dt.size):
-            x, y = short[i, k], long[i, k]
-            long[i, k] = min(cap, max(zero, y + dt[k] * (delta * x - zeta)))
-            short[i, k] = min(one, max(low, x + dt[k] * (gamma * (one + kappa * sign * voltage[i, k]) - one - y)))
-        for k in range(dt.size):
-            pull = rate[i, 1, k] + size * short[i, k]
-            rate[i, 0, k] = alpha * (rate[i, 0, k] + h) - pull_rate * pull * voltage[i, k]
+    for begin in range(U64(0), U64(field.size), U64(ROWS)):
+        size, at = spread_out(lanes, field, begin, own), begin * lanes
+        for x in range(size):
+            h, v, before, y = own[x], voltage[at + x], short[at + x], long[at + x]
+            sign = one if h > zero else (-one if h < zero else zero)
+            long[at + x] = min(cap, max(zero, y + dt[x] * (delta * before - zeta)))
+            after = min(one, max(low, before + dt[x] * (gamma * (one + kappa * sign * v) - one - y)))
+            short[at + x] = after
+            drive[at + x] = alpha * (drive[at + x] + h) - pull_rate * (pull[at + x] + abs(h) * after) * v
+            pull[at + x] = zero
 
 
 @inlined
@@ -209,49 +229,70 @@ def clause_start(problem, memories, voltage, c):
     _, pairs, _, polarity, _, (variables, longer_polarity, _) = problem
     memory, _, _, longer_memory = memories
     half, one = F32(0.5), F32(1)
-    for e in range(memory.shape[0]):
+    for e in range(memory.shape[1]):
         for k in range(voltage.shape[1]):
             false_first = half - half * polarity[e, 0] * voltage[pairs[e, 0], k]
             false_second = half - half * polarity[e, 1] * voltage[pairs[e, 1], k]
-            memory[e, 0, k] = c[EPSILON] + min(false_first, false_second)
-    for e in range(longer_memory.shape[0]):
+            memory[0, e, k] = c[EPSILON] + min(false_first, false_second)
+    for e in range(longer_memory.shape[1]):
         for k in range(voltage.shape[1]):
             unsatisfied = one
             for j in range(variables.shape[1]):
                 sign = longer_polarity[e, j]
                 if sign != 0:
                     unsatisfied = min(unsatisfied, half - half * sign * voltage[variables[e, j], k])
-            longer_memory[e, 0, k] = c[EPSILON] + unsatisfied
+            longer_memory[0, e, k] = c[EPSILON] + unsatisfied
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def clause_advance(problem, memories, voltage, rate, scratch, c, dt):
     """Clauses of two literals, of one, and of more."""
     _, pairs, weight, polarity, unit, longer = problem
     memory, _, unit_long, longer_memory = memories
-    push, falsehood, numbers = scratch
-    clause_pass(pairs, weight, polarity, memory, voltage, rate, push, c, dt)
-    clause_units(unit, unit_long, voltage, rate, c, dt)
-    longer_pass(longer, longer_memory, voltage, rate, falsehood, numbers, c, dt)
+    buffers, falsehood, numbers = scratch
+    v, r, unit_long = voltage.ravel(), rate[0].ravel(), unit_long.ravel()
+    of_pairs = (pairs, weight, polarity, memory[0].ravel(), memory[1].ravel())
+    # Numbers that the compiler knows make short loops over the lanes single instructions.
+    if dt.size == 4:
+        clause_pass(U64(4), *of_pairs, v, r, buffers, c)
+        clause_units(U64(4), unit, unit_long, v, r, buffers, c)
+    elif dt.size == 8:
+        clause_pass(U64(8), *of_pairs, v, r, buffers, c)
+        clause_units(U64(8), unit, unit_long, v, r, buffers, c)
+    else:
+        clause_pass(U64(16), *of_pairs, v, r, buffers, c)
+        clause_units(U64(16), unit, unit_long, v, r, buffers, c)
+    longer_pass(longer, longer_memory, voltage, r, falsehood, numbers, c, dt)
 
 
 @inlined
 def bond_start(problem, memories, voltage, c):
     """All short-term memories begin at ``short_term_start``."""
     memory, unit_short, _, _ = memories
-    for e in range(memory.shape[0]):
+    for e in range(memory.shape[1]):
         for k in range(voltage.shape[1]):
-            memory[e, 0, k] = c[SHORT_TERM_START]
+            memory[0, e, k] = c[SHORT_TERM_START]
     unit_short[:] = c[SHORT_TERM_START]
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+@njit(nogil=True, cache=True, forceinline=True)
 def bond_advance(problem, memories, voltage, rate, scratch, c, dt):
     """Bonds, then fields."""
     _, pairs, bond, _, field, _ = problem
     memory, field_short, field_long, _ = memories
-    bond_pass(pairs, bond, memory, voltage, rate, scratch[0], c, dt)
-    bond_fields(field, field_short, field_long, voltage, rate, c, dt)
+    buffers, _, _ = scratch
+    v, drive, pull = voltage.ravel(), rate[0].ravel(), rate[1].ravel()
+    of_pairs = (pairs, bond, memory[0].ravel(), memory[1].ravel())
+    of_fields = (field, field_short.ravel(), field_long.ravel())
+    if dt.size == 4:
+        bond_pass(U64(4), *of_pairs, v, drive, pull, buffers, c)
+        bond_fields(U64(4), *of_fields, v, drive, pull, buffers, c)
+    elif dt.size == 8:
+        bond_pass(U64(8), *of_pairs, v, drive, pull, buffers, c)
+        bond_fields(U64(8), *of_fields, v, drive, pull, buffers, c)
+    else:
+        bond_pass(U64(16), *of_pairs, v, drive, pull, buffers, c)
+        bond_fields(U64(16), *of_fields, v, drive, pull, buffers, c)
 
 
 def start(kind, problem, memories, voltage, c):
@@ -292,6 +333,56 @@ def passes_of(kind: type) -> "Compiled":
     return next(row for row in FIELDS.values() if type(row.kind) is kind)
 
 
+@inlined
+def mix(rate, before, lag, squares, begin, size):
+    """Mix the rates of a chunk with those of the last step, and add their squares to those of other chunks."""
+    for x in range(size):
+        now = rate[begin + x]
+        mixed = now + lag * (before[begin + x] - now)
+        before[begin + x] = now
+        rate[begin + x] = mixed
+        squares[x] += mixed * mixed
+
+
+@inlined
+def move(voltage, rate, dt, begin, size):
+    """Move the voltages of a chunk, and set their rates to zero."""
+    for x in range(size):
+        voltage[begin + x] += dt[x] * rate[begin + x]
+        rate[begin + x] = F32(0)
+
+
+@inlined
+def look(lanes, digital, linear, voltage, states, quenches, n_looks, step):
+    """Read the bits of all lanes; compare with the best ones, and quench a copy, where they have changed.
+
+    ``quenches`` is -1 where the bits are only brought up to the voltages, 0 for no quench, 1 for one.
+    """
+    state, tried, energy, reached, lowest, found_at, changed, best, rows = states
+    change, better = rows
+    if step > 0:
+        read_out_listed(lanes, digital, voltage, *state, energy, changed, change)
+        if n_looks % REFRESH == 0:
+            local_fields_listed(lanes, digital, linear, *state, energy)
+    else:
+        local_fields_listed(lanes, digital, linear, *state, energy)
+    some = F32(0)
+    for k in range(lanes):
+        some += changed[k]
+    if quenches < 0 or some == F32(0):
+        return
+    keep_better_listed(lanes, energy, lowest, state[0], best, step, found_at, better, change)
+    if quenches > 0:
+        copy(state[0], tried[0])
+        copy(state[1], tried[1])
+        copy(state[2], tried[2])
+        copy(energy, reached)
+        quench_listed(lanes, digital, *tried, reached, changed, change)
+        keep_better_listed(lanes, reached, lowest, tried[0], best, step, found_at, better, change)
+    for k in range(lanes):
+        changed[k] = F32(0)
+
+
 @njit(nogil=True, cache=True)
 def integrate_all(begin, end, stop, problem, control, start, steps, best, found_at, last, times, states):
     """Integrate the blocks of restarts numbered ``begin`` to ``end - 1``, problem by problem.
@@ -303,9 +394,10 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
         control: Step control, named in ``common.CONTROL``, ``(n_problems, 5)``.
-        start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed.
+        start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed;
+            where ``long`` has size 0 in place of n_blocks, memories begin at rest and are not returned.
         steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
-        best: Out, ``(n_problems, n_blocks, lanes, n)``.
+        best: Out, ``(n_problems, n_blocks, n, lanes)``.
         found_at: Out, the step at which it was met, ``(n_problems, n_blocks, lanes)``; 0 for the initial state.
         last: Out, the number of steps done, likewise.
         times: Out, ``(n_problems, n_blocks, lanes, n_records)``.
@@ -313,124 +405,115 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
     """
     kind, constants, pairs, weight, polarity, unit, longer, digital, linear = problem
     variables, longer_polarity, longer_weight = longer
-    offsets, neighbour, edge, coupling, in_clause, clause_of, clause_weight = digital
+    offsets, neighbour, coupling, in_clause, clause_of, clause_weight = digital
     voltage, long, unit_long, longer_long, seed = start
     n_blocks = voltage.shape[1]
+    none = np.empty((0, voltage.shape[3]), F32)
+    fresh = long.shape[1] == 0
     for item in range(begin, end):
         if stop[0] != 0:
             return
         p, b = item // n_blocks, item % n_blocks
-        found, ended = integrate(
+        of_clauses = (in_clause, clause_of, variables, longer_polarity, clause_weight[p])
+        integrate(
             (kind, pairs, weight[p], polarity[p], unit[p], (variables, longer_polarity, longer_weight[p])),
-            (
-                offsets,
-                neighbour,
-                edge,
-                coupling[p],
-                in_clause,
-                clause_of,
-                variables,
-                longer_polarity,
-                clause_weight[p],
-            ),
+            (offsets, neighbour, coupling[p], *of_clauses),
             linear[p],
             constants[p],
             control[p],
-            (voltage[p, b], long[p, b], unit_long[p, b], longer_long[p, b], seed[p, b]),
+            voltage[p, b],
+            (none, none, none) if fresh else (long[p, b], unit_long[p, b], longer_long[p, b]),
+            seed[p, b],
             steps,
             stop,
-            best[p, b],
+            best[p, b].ravel(),
+            found_at[p, b],
+            last[p, b],
             times[p, b],
             states[p, b],
         )
-        copy(found, found_at[p, b])
-        copy(ended, last[p, b])
 
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
-def integrate(problem, digital, linear, c, control, begin, steps, stop, best, times, states):
-    """Integrate the lanes of a block; return the step at which each one's ``best`` was met, and its last step.
+def integrate(
+    problem, digital, linear, c, control, voltage, kept, seeds, steps, stop, best, found_at, last, times, states
+):
+    """Integrate the lanes of a block.
 
     Args:
         problem: (kind, pairs, weight or bond, polarity, unit or field, the longer clauses: variables, polarity
             and weight).
-        digital: What ``flip`` needs.
+        digital: What ``flip_listed`` needs.
         linear: ``(n,)``, of the energy.
         c: Constants of the field, named in ``common.CONSTANTS``.
         control: Step control, named in ``common.CONTROL``.
-        begin: (voltage, long-term memories less 1 of pairs, of units and of longer clauses), each with the lanes
-            last, initial values in and final values out; and the seeds of the noise.
+        voltage: ``(n, lanes)``, initial values in and final values out.
+        kept: Long-term memories less 1 of pairs, of units and of longer clauses, with the lanes last, in and out;
+            empty for memories at rest that nobody asks for.
+        seeds: Of the noise.
         steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
             quench. A restart rests from the first reading at or after step min_steps + stall found_at.
         stop: One number; anything but 0 ends the integration.
-        best: ``(lanes, n)``, out: the assignments of lowest energy.
+        best: ``(n lanes,)``, out: the assignments of lowest energy.
+        found_at: ``(lanes,)``, out: the step at which each one was met.
+        last: ``(lanes,)``, out: the last step of each lane.
         times: ``(lanes, n_records)``, out.
         states: ``(lanes, n_records, n)``, out.
     """
-    kind, pairs, weight, _, unit, longer = problem
-    longer_variables, _, longer_weight = longer
-    voltage, long, unit_long, longer_long, seeds = begin
+    kind, _, weight, _, unit, longer = problem
+    variables, _, longer_weight = longer
     n_steps, quench_every, every, min_steps, stall = steps
-    half, one = F32(0.5), F32(1)
+    half, zero, one = F32(0.5), F32(0), F32(1)
     n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
-    rate, push = np.zeros((n, 2, lanes), F32), np.empty(2 * lanes, F32)
-    memory, longer_memory = np.empty((n_pairs, 2, lanes), F32), np.empty((n_longer, 2, lanes), F32)
-    unit_short = np.zeros((n, lanes), F32)
-    falsehood = np.empty((longer_variables.shape[1], lanes), F32)
+    rate, memory = np.zeros((2, n, lanes), F32), np.zeros((2, n_pairs, lanes), F32)
+    unit_short, unit_long = np.zeros((n, lanes), F32), np.zeros((n, lanes), F32)
+    longer_memory = np.zeros((2, n_longer, lanes), F32)
+    memories = (memory, unit_short, unit_long, longer_memory)
+    if kept[1].size > 0:
+        copy(kept[0].ravel(), memory[1].ravel())
+        copy(kept[1].ravel(), unit_long.ravel())
+        copy(kept[2].ravel(), longer_memory[1].ravel())
+    start(kind, problem, memories, voltage, c)
+    # Step sizes of the lanes once for each row of a chunk, and two chunks of intermediate results.
+    dts, first, second = np.zeros(ROWS * lanes, F32), np.empty(ROWS * lanes, F32), np.empty(ROWS * lanes, F32)
     # Arrays of their own: rows of one array could overlap for all that the compiler knows.
     smallest, next_smallest, at = np.empty(lanes, F32), np.empty(lanes, F32), np.empty(lanes, F32)
-    scratch = (push, falsehood, (smallest, next_smallest, at, np.empty(lanes, F32), np.empty(lanes, F32)))
-    memories = (memory, unit_short, unit_long, longer_memory)
-    for e in range(n_pairs):
-        for k in range(lanes):
-            memory[e, 1, k] = long[e, k]
-    for e in range(n_longer):
-        for k in range(lanes):
-            longer_memory[e, 1, k] = longer_long[e, k]
-    start(kind, problem, memories, voltage, c)
-    x, field, true = np.empty((lanes, n), F32), np.empty((lanes, n), F32), np.zeros((lanes, n_longer), np.int32)
-    tried, tried_field, tried_true = np.empty(n, F32), np.empty(n, F32), np.empty(n_longer, np.int32)
-    signs, found = np.empty((lanes, n), F32), np.empty(n + 1, np.uint64)
-    energy, changed = np.zeros(lanes), np.full(lanes, True)
-    lowest, found_at = np.full(lanes, 1e300), np.zeros(lanes, np.int64)
-    elapsed, dt, size = np.zeros(lanes), np.zeros(lanes, F32), np.empty(lanes, F32)
-    before = np.zeros((n, lanes), F32)
-    transpose_signs(voltage, x)
+    numbers = (smallest, next_smallest, at, np.empty(lanes, F32), np.empty(lanes, F32))
+    scratch = ((dts, first, second), np.empty((variables.shape[1], lanes), F32), numbers)
+    v, r, before = voltage.ravel(), rate[0].ravel(), np.zeros(n * lanes, F32)
+    chunk = U64(dts.size)
+    rest = U64(r.size) % chunk
+    whole = U64(r.size) - rest
+    x = np.zeros(n * lanes, F32)
+    for i in range(x.size):
+        x[i] = one if v[i] > zero else zero
+    state = (x, np.empty(n * lanes, F32), np.empty(n_longer * lanes, F32))
+    tried = (np.empty(n * lanes, F32), np.empty(n * lanes, F32), np.empty(n_longer * lanes, F32))
+    energy, reached, lowest = np.zeros(lanes), np.zeros(lanes), np.full(lanes, 1e300)
+    rows = (np.empty(lanes, F32), np.empty(lanes, F32))
+    seen = (state, tried, energy, reached, lowest, found_at, np.ones(lanes, F32), best, rows)
+    elapsed, dt = np.zeros(lanes), np.zeros(lanes, F32)
     for k in range(lanes):
-        energy[k] = local_fields_listed(digital, linear, pairs, x[k], field[k], true[k])
-    last, n_running = np.full(lanes, n_steps), lanes
-    n_reads, counter = 0, U64(0)
+        found_at[k], last[k] = 0, n_steps
+    n_running, n_looks, counter = lanes, 0, U64(0)
     for step in range(n_steps + 1):
         recorded = every > 0 and step > 0 and step % every == 0
         reads = quench_every == 0 or step % quench_every == 0
-        if step > 0 and (reads or recorded):
-            transpose_signs(voltage, signs)
-            n_reads += 1
-            for k in range(lanes):
-                change, n_changed = read_out_listed(digital, signs[k], x[k], field[k], true[k], found)
-                energy[k] += change
-                changed[k] = changed[k] or n_changed > 0
-                if n_reads % REFRESH == 0:
-                    energy[k] = local_fields_listed(digital, linear, pairs, x[k], field[k], true[k])
-        if reads:
-            for k in range(lanes):
-                if not changed[k]:
-                    continue
-                lowest[k], found_at[k] = keep_better(energy[k], lowest[k], x[k], best[k], step, found_at[k])
-                if quench_every > 0:
-                    copy(x[k], tried)
-                    copy(field[k], tried_field)
-                    copy(true[k], tried_true)
-                    reached = energy[k] + quench_listed(digital, tried, tried_field, tried_true)
-                    lowest[k], found_at[k] = keep_better(reached, lowest[k], tried, best[k], step, found_at[k])
-                changed[k] = False
+        if reads or recorded:
+            quenches = (1 if quench_every > 0 else 0) if reads else -1
+            n_looks += 1
+            if lanes == 4:
+                look(U64(4), digital, linear, v, seen, quenches, n_looks, step)
+            elif lanes == 8:
+                look(U64(8), digital, linear, v, seen, quenches, n_looks, step)
+            else:
+                look(U64(16), digital, linear, v, seen, quenches, n_looks, step)
         if recorded:
             for k in range(lanes):
                 times[k, step // every - 1] = elapsed[k]
                 for i in range(n):
-                    states[k, step // every - 1, i] = x[k, i] > half
+                    states[k, step // every - 1, i] = x[i * lanes + k] > half
         # One pass moves the memories by the step that led here and finds the rate of the voltages.
-        rate[:] = 0
         advance(kind, problem, memories, voltage, rate, scratch, c, dt)
         if reads:
             for k in range(lanes):
@@ -439,35 +522,33 @@ def integrate(problem, digital, linear, c, control, begin, steps, stop, best, ti
                     n_running -= 1
         if step == n_steps or stop[0] != 0 or n_running == 0:
             break
-        lag = control[LAG] if step > 0 else F32(0)
-        size[:] = 0
-        for i in range(n):
-            for k in range(lanes):
-                now = rate[i, 0, k]
-                rate[i, 0, k] += lag * (before[i, k] - now)
-                before[i, k] = now
-            for k in range(lanes):
-                size[k] += rate[i, 0, k] * rate[i, 0, k]
+        lag = control[LAG] if step > 0 else zero
+        for y in range(first.size):
+            first[y] = zero
+        for at_chunk in range(U64(0), whole, chunk):
+            mix(r, before, lag, first, at_chunk, chunk)
+        mix(r, before, lag, first, whole, rest)
         for k in range(lanes):
+            size = zero
+            for row in range(ROWS):
+                size += first[row * lanes + k]
             # A step of size 0 leaves voltages and memories where they are.
-            change = control[CHANGE] / max(F32(math.sqrt(size[k] / F32(n))), TINY)
-            dt[k] = min(control[DT_MAX], max(control[DT_MIN], change)) if last[k] == n_steps else F32(0)
+            change = control[CHANGE] / max(F32(math.sqrt(size / F32(n))), TINY)
+            dt[k] = min(control[DT_MAX], max(control[DT_MIN], change)) if last[k] == n_steps else zero
             elapsed[k] += dt[k]
-        for i in range(n):
-            for k in range(lanes):
-                voltage[i, k] += dt[k] * rate[i, 0, k]
+            for row in range(ROWS):
+                dts[row * lanes + k] = dt[k]
+        for at_chunk in range(U64(0), whole, chunk):
+            move(v, r, dts, at_chunk, chunk)
+        move(v, r, dts, whole, rest)
         if control[NOISE] > 0:
             for i in range(n):
                 for k in range(lanes):
                     voltage[i, k] += control[NOISE] * math.sqrt(dt[k]) * uniform(seeds[k], counter + U64(i))
             counter += U64(n)
-        for i in range(n):
-            for k in range(lanes):
-                voltage[i, k] = min(one, max(-one, voltage[i, k]))
-    for e in range(n_pairs):
-        for k in range(lanes):
-            long[e, k] = memory[e, 1, k]
-    for e in range(n_longer):
-        for k in range(lanes):
-            longer_long[e, k] = longer_memory[e, 1, k]
-    return found_at, last
+        for i in range(v.size):
+            v[i] = min(one, max(-one, v[i]))
+    if kept[1].size > 0:
+        copy(memory[1].ravel(), kept[0].ravel())
+        copy(unit_long.ravel(), kept[1].ravel())
+        copy(longer_memory[1].ravel(), kept[2].ravel())

@@ -68,11 +68,12 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
         push = F32(0)
         for j in range(n_first):
             at = row + j
+            w = weight[at]
             short[at], long[at], first, second = clause(
-                weight[at], voltage[j], half + side[j] * h, short[at], long[at], rates
+                half - math.copysign(half, w) * voltage[j], half + side[j] * h, short[at], long[at], rates
             )
-            drive[j] += first
-            push -= side[j] * second
+            drive[j] += w * first
+            push -= side[j] * (abs(w) * second)
         drive[n_first + i] += -(push + push) if U64(2) * i >= n_second else push + push
         row += n_first
 
