@@ -85,12 +85,13 @@ def _run_rows(
     voltage = _pad(float32(start.voltage), n_first, width, width + height)
     kept: list[Numbers] = [float32(memory) for memory in start.kept]
     if kept:
-        matrix = kept[0].reshape(n_problems, n_restarts * n_second, n_first)
-        matrix = _pad(matrix, n_first, width, width).reshape(n_problems, n_restarts, n_second * width)
+        matrix = np.zeros((n_problems, n_restarts, padded.weight.shape[1]), np.float32)
+        flat = _pad(kept[0].reshape(n_problems, n_restarts * n_second, n_first), n_first, width, width)
+        matrix[..., : n_second * width] = flat.reshape(n_problems, n_restarts, n_second * width)
         kept = [matrix, _pad(kept[1], n_first, width, width + height)]
     else:
-        n_kept = n_restarts if remember else 0
-        kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in (n_second * width, width + height)]
+        n_kept, sizes = n_restarts if remember else 0, (padded.weight.shape[1], width + height)
+        kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in sizes]
     arrays = (padded.kind, padded.sizes, padded.side, constants, *padded[4:])
     out = _outputs((n_problems, n_restarts), width + height, steps)
     state = (voltage, *kept, to_numpy(start.seed).astype(np.uint64))
@@ -102,7 +103,7 @@ def _run_rows(
 
     memories = []
     if remember:
-        of_pairs = kept[0].reshape(n_problems, n_restarts, n_second, width)
+        of_pairs = kept[0][..., : n_second * width].reshape(n_problems, n_restarts, n_second, width)
         memories = [np.ascontiguousarray(of_pairs[..., :n_first]), unpad(kept[1])]
     return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps, start.voltage)
 
@@ -133,7 +134,7 @@ def _prepared(field: Any, problem: Qubo, graph: Bipartite) -> _Prepared:
     """Scale problems into the machine's units and into those of the digital state; pad the layers."""
     n_problems, n_first, n_second = problem.offset.shape[0], graph.n_first, graph.n_second
     width, height = (-(-n // _VECTOR) * _VECTOR for n in (n_first, n_second))
-    weight = np.zeros((n_problems, n_second * width), np.float32)
+    weight = np.zeros((n_problems, (n_second + n_second % 2) * width), np.float32)
     coupling, transposed = (np.zeros((n_problems, height * width), np.float32) for _ in range(2))
     unit, linear = (np.zeros((n_problems, width + height), np.float32) for _ in range(2))
     scalars = np.empty((n_problems, 3))
@@ -163,11 +164,14 @@ def _run_lanes(
     n_blocks, lanes_each = _blocks(n_restarts)
     sparse = _sparse(passes.listed(machine), problem, n_problems)
     voltage = _to_lanes(float32(start.voltage), n_blocks, lanes_each)
-    sizes = (sparse.weight.shape[1], n, sparse.longer_weight.shape[1])
-    if start.kept:
-        memories = [_to_lanes(float32(memory), n_blocks, lanes_each) for memory in start.kept]
-    else:
-        memories = [np.zeros((n_problems, n_blocks * remember, size, lanes_each), np.float32) for size in sizes]
+    # Arrays of numpy lie in huge pages where they can.
+    memories = [
+        np.zeros((n_problems, n_blocks, *shape, lanes_each), np.float32)
+        for shape in ((2, sparse.weight.shape[1]), (n,), (2, sparse.longer_weight.shape[1]))
+    ]
+    long = [memories[0][:, :, 1], memories[1], memories[2][:, :, 1]]
+    for memory, kept in zip(long, start.kept, strict=False):
+        memory[:] = _to_lanes(float32(kept), n_blocks, lanes_each)
     seed = np.ascontiguousarray(
         _to_lanes(to_numpy(start.seed).astype(np.uint64)[..., None], n_blocks, lanes_each)[:, :, 0]
     )
@@ -182,8 +186,8 @@ def _run_lanes(
     kernel = lanes.integrate_all if ours else _of_this_process()
     share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, best, *out), _INLINED)
     out = [x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out]
-    best, final, *kept = (_from_lanes(x, n_restarts) for x in (best, voltage, *(memories if remember else ())))
-    return _finish((best, *out), final, kept, steps, start.voltage)
+    best, final, *remembered = (_from_lanes(x, n_restarts) for x in (best, voltage, *(long if remember else ())))
+    return _finish((best, *out), final, remembered, steps, start.voltage)
 
 
 @cache

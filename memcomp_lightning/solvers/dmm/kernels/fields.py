@@ -45,8 +45,8 @@ class Compiled(NamedTuple):
         of_problem: From field and machine to the settings that differ from problem to problem, ``(n_problems,)``.
         start: ``start(problem, memories, voltage, c)`` writes the short-term memories.
         advance: ``advance(problem, memories, voltage, rate, scratch, c, dt)`` moves the memories by ``dt``, one
-            number a lane, at the present voltages, and adds the rate of the voltages to ``rate[0]``, where ``rate``
-            has the shape ``(2, n, lanes)``; ``rate[1]`` is scratch, at first 0.
+            number a lane, at the present voltages, and adds the rate of the voltages to ``rate[0]``. The shape of
+            ``rate`` is ``(2, n, lanes)``, and ``rate[1]`` is scratch, at first 0.
         obstacle: Why some settings of the field have no compiled passes, and what to do; None if these have.
     """
 

@@ -394,8 +394,8 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         problem: (kind, constants, pairs, weight, polarity, unit, longer, digital, linear); constants, weight,
             unit and linear have an axis of problems, so have the weights in longer and digital.
         control: Step control, named in ``common.CONTROL``, ``(n_problems, 5)``.
-        start: (voltage, long, unit_long, longer_long), each ``(n_problems, n_blocks, ..., lanes)``, and the seed;
-            where ``long`` has size 0 in place of n_blocks, memories begin at rest and are not returned.
+        start: (voltage, memory, unit_long, longer_memory), each ``(n_problems, n_blocks, ..., lanes)``, and the
+            seeds.
         steps: (n_steps, quench_every, record_every, min_steps, stall), see :func:`integrate`.
         best: Out, ``(n_problems, n_blocks, n, lanes)``.
         found_at: Out, the step at which it was met, ``(n_problems, n_blocks, lanes)``; 0 for the initial state.
@@ -406,10 +406,8 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
     kind, constants, pairs, weight, polarity, unit, longer, digital, linear = problem
     variables, longer_polarity, longer_weight = longer
     offsets, neighbour, coupling, in_clause, clause_of, clause_weight = digital
-    voltage, long, unit_long, longer_long, seed = start
+    voltage, memory, unit_long, longer_memory, seed = start
     n_blocks = voltage.shape[1]
-    none = np.empty((0, voltage.shape[3]), F32)
-    fresh = long.shape[1] == 0
     for item in range(begin, end):
         if stop[0] != 0:
             return
@@ -422,7 +420,7 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
             constants[p],
             control[p],
             voltage[p, b],
-            (none, none, none) if fresh else (long[p, b], unit_long[p, b], longer_long[p, b]),
+            (memory[p, b], unit_long[p, b], longer_memory[p, b]),
             seed[p, b],
             steps,
             stop,
@@ -436,7 +434,21 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
 
 @njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
 def integrate(
-    problem, digital, linear, c, control, voltage, kept, seeds, steps, stop, best, found_at, last, times, states
+    problem,
+    digital,
+    linear,
+    c,
+    control,
+    voltage,
+    memories,
+    seeds,
+    steps,
+    stop,
+    best,
+    found_at,
+    last,
+    times,
+    states,
 ):
     """Integrate the lanes of a block.
 
@@ -448,8 +460,8 @@ def integrate(
         c: Constants of the field, named in ``common.CONSTANTS``.
         control: Step control, named in ``common.CONTROL``.
         voltage: ``(n, lanes)``, initial values in and final values out.
-        kept: Long-term memories less 1 of pairs, of units and of longer clauses, with the lanes last, in and out;
-            empty for memories at rest that nobody asks for.
+        memories: Of pairs, ``(2, n_pairs, lanes)``, long-term ones of units, ``(n, lanes)``, and of longer
+            clauses; the long-term ones, less 1, are initial values in, all are final values out.
         seeds: Of the noise.
         steps: (n_steps, quench_every, record_every, min_steps, stall); quench_every = 0 reads each step without a
             quench. A restart rests from the first reading at or after step min_steps + stall found_at.
@@ -460,19 +472,14 @@ def integrate(
         times: ``(lanes, n_records)``, out.
         states: ``(lanes, n_records, n)``, out.
     """
-    kind, _, weight, _, unit, longer = problem
+    kind, _, _, _, unit, longer = problem
     variables, _, longer_weight = longer
     n_steps, quench_every, every, min_steps, stall = steps
     half, zero, one = F32(0.5), F32(0), F32(1)
-    n, n_pairs, n_longer, lanes = unit.size, weight.size, longer_weight.size, voltage.shape[1]
-    rate, memory = np.zeros((2, n, lanes), F32), np.zeros((2, n_pairs, lanes), F32)
-    unit_short, unit_long = np.zeros((n, lanes), F32), np.zeros((n, lanes), F32)
-    longer_memory = np.zeros((2, n_longer, lanes), F32)
+    n, n_longer, lanes = unit.size, longer_weight.size, voltage.shape[1]
+    memory, unit_long, longer_memory = memories
+    rate, unit_short = np.zeros((2, n, lanes), F32), np.zeros((n, lanes), F32)
     memories = (memory, unit_short, unit_long, longer_memory)
-    if kept[1].size > 0:
-        copy(kept[0].ravel(), memory[1].ravel())
-        copy(kept[1].ravel(), unit_long.ravel())
-        copy(kept[2].ravel(), longer_memory[1].ravel())
     start(kind, problem, memories, voltage, c)
     # Step sizes of the lanes once for each row of a chunk, and two chunks of intermediate results.
     dts, first, second = np.zeros(ROWS * lanes, F32), np.empty(ROWS * lanes, F32), np.empty(ROWS * lanes, F32)
@@ -548,7 +555,3 @@ def integrate(
             counter += U64(n)
         for i in range(v.size):
             v[i] = min(one, max(-one, v[i]))
-    if kept[1].size > 0:
-        copy(memory[1].ravel(), kept[0].ravel())
-        copy(unit_long.ravel(), kept[1].ravel())
-        copy(longer_memory[1].ravel(), kept[2].ravel())

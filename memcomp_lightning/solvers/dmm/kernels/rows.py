@@ -60,22 +60,29 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
     are in the first halves of their layers, or in the second ones; ``side`` is 1/2 in the first half of the first
     layer, else -1/2. ``short`` holds x_s + epsilon and ``long`` x_l - 1.
     """
-    rates, half, row = clause_rates(c, dt), F32(0.5), U64(0)
-    for i in range(n_second):
-        h = voltage[n_first + i]
-        if U64(2) * i >= n_second:
-            h = -h
-        push = F32(0)
+    rates, half, one, two, row = clause_rates(c, dt), F32(0.5), U64(1), U64(2), U64(0)
+    for i in range(U64(0), n_second, two):
+        # Two rows at a time: what a row costs besides its pairs is most of the time of a short one.
+        above, below = two * i >= n_second, two * (i + one) >= n_second
+        h, g = voltage[n_first + i], voltage[n_first + i + one]
+        h, g = -h if above else h, -g if below else g
+        push, push_below = F32(0), F32(0)
         for j in range(n_first):
-            at = row + j
-            w = weight[at]
+            at, v, s = row + j, voltage[j], side[j]
+            w, after = weight[at], at + n_first
+            u = weight[after]
             short[at], long[at], first, second = clause(
-                half - math.copysign(half, w) * voltage[j], half + side[j] * h, short[at], long[at], rates
+                half - math.copysign(half, w) * v, half + s * h, short[at], long[at], rates
             )
-            drive[j] += w * first
-            push -= side[j] * (abs(w) * second)
-        drive[n_first + i] += -(push + push) if U64(2) * i >= n_second else push + push
-        row += n_first
+            short[after], long[after], first_below, second_below = clause(
+                half - math.copysign(half, u) * v, half + s * g, short[after], long[after], rates
+            )
+            drive[j] += w * first + u * first_below
+            push -= s * (abs(w) * second)
+            push_below -= s * (abs(u) * second_below)
+        drive[n_first + i] += -(push + push) if above else push + push
+        drive[n_first + i + one] += -(push_below + push_below) if below else push_below + push_below
+        row += two * n_first
 
 
 @inlined
@@ -159,7 +166,7 @@ def bond_fields(field, short, long, voltage, drive, pull, c, dt):
 def start_short(n_first, n_second, weight, side, short, voltage, epsilon):
     """Write x_s(0) + epsilon = C(0) + epsilon."""
     half, row = F32(0.5), U64(0)
-    for i in range(n_second):
+    for i in range(U64(short.size) // n_first):
         h = voltage[n_first + i]
         if U64(2) * i >= n_second:
             h = -h
