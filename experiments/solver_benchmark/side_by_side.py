@@ -11,12 +11,11 @@ import simulated_bifurcation
 import torch
 from dwave.samplers import SteepestDescentSampler
 from opponents import Opponent, Problem, Reads, SimulatedAnnealing, Tabu, answer, energies, model
-from quadratise import quadratise
 from simulated_bifurcation.core import Ising
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.problems import Bipartite, Qubo
+from memcomp_lightning.problems import Bipartite, Qubo, as_qubo
 from memcomp_lightning.solvers import AlternatingDescent
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, VectorField
 
@@ -43,7 +42,7 @@ class Descent:
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        qubo = quadratise(problem)
+        qubo = as_qubo(problem)
         if not isinstance(qubo.graph, Bipartite):
             bqm, _, build = model(problem)
             begin = time.perf_counter()
@@ -78,7 +77,7 @@ class GibbsAnnealing:
     schedule: str = "geometric"
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        qubo = quadratise(problem)
+        qubo = as_qubo(problem)
         if not isinstance(qubo.graph, Bipartite):
             annealing = SimulatedAnnealing(
                 range_over_scale=self.range_over_scale, schedule=self.schedule, acceptance="Gibbs"

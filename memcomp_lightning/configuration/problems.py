@@ -10,8 +10,7 @@ from memcomp_lightning.configuration.values import check_values
 from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.problems import FORMATS, Problem, read_problem
 from memcomp_lightning.solvers import QuboSolver
-from memcomp_lightning.solvers.dmm import DmmSolver
-from memcomp_lightning.solvers.solving import as_qubo, check_memory
+from memcomp_lightning.solvers.solving import check_memory
 
 _SETTINGS = ("problem", "format", "maximise", "seed", "solver")
 
@@ -34,8 +33,6 @@ def prepare(config: DictConfig) -> tuple[Problem, QuboSolver]:
         )
     solver: QuboSolver = instantiate(config.solver)
     problem = _read(str(config.problem), config.format, config.maximise)
-    if not isinstance(solver, DmmSolver):
-        as_qubo(problem.problem)
     check_memory(problem, solver)
     return problem, solver
 

@@ -8,6 +8,7 @@ from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedSta
 from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "BranchAndBound",
     "BruteForce",
     "GibbsAnnealing",
+    "PenaltyLoop",
     "Portfolio",
     "QuboSolution",
     "QuboSolver",

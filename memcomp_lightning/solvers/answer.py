@@ -30,8 +30,8 @@ class Answer:
         energy: Its energy: the score's value, or minus it if that is maximised, plus the penalty of each
             unsatisfied hard clause.
         energies: Energy of each restart; None where it was not run.
-        status: How each restart ended. A proven minimum that leaves a hard clause unsatisfied is INFEASIBLE, one
-            that rests on rounded sums ROUNDED.
+        status: How each restart ended. A proven minimum that leaves a hard clause unsatisfied is INFEASIBLE,
+            another answer that does NOT_FEASIBLE; a minimum that rests on rounded sums is ROUNDED.
     """
 
     assignment: NDArray[np.bool_]
@@ -76,8 +76,9 @@ class Answer:
             found.append((energy, k, score))
             if status[k] is Status.OPTIMAL and not exact:
                 status[k] = Status.ROUNDED
-            elif status[k] is Status.OPTIMAL and score.hard_unsatisfied:
-                status[k] = Status.INFEASIBLE
+            if score.hard_unsatisfied:
+                proven = status[k] in (Status.OPTIMAL, Status.INFEASIBLE)
+                status[k] = Status.INFEASIBLE if proven else Status.NOT_FEASIBLE
         energy, best, score = min(found)
         return Answer(problem.expand(solution.assignments[best] > 0.5), score, energy, energies, status)
 

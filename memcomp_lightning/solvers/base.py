@@ -31,6 +31,7 @@ class Status(IntEnum):
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
+    NOT_FEASIBLE = 8, "No assignment that keeps all constraints was found; more restarts may find one."
 
 
 class RecordedStates(Protocol):
@@ -55,6 +56,8 @@ class QuboSolution:
         steps: ``(*problems, n_restarts)`` int64, integration steps or sweeps done.
         wall_time_s: Seconds for all problems and restarts together.
         trajectory: What the solver passed through, if it was asked to record it.
+        broken: Number of constraints that each assignment breaks, ``(*problems, n_restarts)`` int64; None where
+            the problem has none.
     """
 
     assignments: Array
@@ -63,18 +66,28 @@ class QuboSolution:
     steps: Array
     wall_time_s: float
     trajectory: RecordedStates | None = None
+    broken: Array | None = None
 
     @property
     def best_energy(self) -> Array:
-        """Lowest energy over the restarts, ``(*problems,)`` float64."""
-        return namespace(self.energies).min(self.energies, axis=-1)
+        """Energy of :attr:`best`, ``(*problems,)`` float64."""
+        return namespace(self.energies).min(self._ranked, axis=-1)
 
     @property
     def best(self) -> Array:
-        """Assignment of lowest energy, ``(*problems, n)``."""
-        xp, index = namespace(self.energies), self.energies.argmin(-1)[..., None, None]
+        """Assignment of lowest energy among those that break the fewest constraints, ``(*problems, n)``."""
+        xp, index = namespace(self.energies), self._ranked.argmin(-1)[..., None, None]
         index = xp.broadcast_to(index, (*index.shape[:-1], self.assignments.shape[-1]))
         return xp.take_along_axis(self.assignments, index, axis=-2)[..., 0, :]
+
+    @property
+    def _ranked(self) -> Array:
+        """Energies, infinite where another assignment breaks fewer constraints."""
+        if self.broken is None:
+            return self.energies
+        xp = namespace(self.energies)
+        fewest = xp.min(self.broken, axis=-1)[..., None]
+        return xp.where(self.broken == fewest, self.energies, xp.inf)
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""

@@ -5,10 +5,11 @@ import os
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import UserError, require
-from memcomp_lightning.problems import Bipartite, Problem, Qubo, WeightedMaxSat, to_qubo
+from memcomp_lightning.problems import Bipartite, Constrained, Problem, Qubo, WeightedMaxSat, as_qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.solvers.dmm import DmmSolver, default_steps
 
 MOST_RECORDED = 4 * 2**30
@@ -16,24 +17,28 @@ MOST_RECORDED = 4 * 2**30
 
 
 def minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
-    """The solver's answer; without variables there is one state, and no solver has to look for it."""
+    """The solver's answer, with penalties for hard clauses as they need them where it proves nothing.
+
+    Without variables there is one state, and no solver has to look for it.
+    """
     generator, given = rng.numpy_stream(seed, "solver"), problem.problem
     if given.n == 0:
         return BruteForce().minimise(as_qubo(given), generator=generator)
     try:
-        if isinstance(solver, DmmSolver):
-            return solver.minimise(given, generator=generator)
-        exact = problem.integers if isinstance(solver, BruteForce) and not problem.resolved else None
-        return solver.minimise(as_qubo(given) if exact is None else exact, generator=generator)
+        proves = isinstance(solver, BruteForce)
+        if proves and problem.integers is not None and not problem.resolved:
+            return solver.minimise(problem.integers, generator=generator)
+        if problem.constrained is not None and not proves:
+            return PenaltyLoop(solver=solver).minimise(problem.constrained, generator=generator)
+        if getattr(solver, "takes_clauses", False):
+            return solver.minimise(given, generator=generator)  # type: ignore[arg-type]
+        if isinstance(given, WeightedMaxSat) and given.longer:
+            return PenaltyLoop(solver=solver).minimise(Constrained.of(given, []), generator=generator)
+        return solver.minimise(as_qubo(given), generator=generator)
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MemoryError) or "memory" in str(error):
             raise UserError(_too_large(problem, solver)) from error
         raise
-
-
-def as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
-    """The problem as a QUBO, which every solver takes; DmmSolver takes clauses as they are."""
-    return problem if isinstance(problem, Qubo) else to_qubo(problem)
 
 
 def check_memory(problem: Problem, solver: QuboSolver) -> None:

@@ -9,11 +9,12 @@ from typing import Any
 import hydra
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.arguments import read
-from memcomp_lightning.cli.output import make_tolerant, refuse, say
+from memcomp_lightning.cli.output import NOT_FEASIBLE, make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line
 from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.hydra_versions import MAIN
@@ -41,9 +42,11 @@ def solve(config: DictConfig) -> None:
         problem, solver = prepare(config)
         say("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]))
         solution = minimise(problem, solver, config.seed)
-        _write(Path(settings.runtime.output_dir), config, problem, solution)
+        answer = _write(Path(settings.runtime.output_dir), config, problem, solution)
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
+    if answer.score.hard_unsatisfied and settings.mode is RunMode.RUN:  # a sweep goes on
+        sys.exit(NOT_FEASIBLE)
 
 
 def _headline(problem: Problem) -> str:
@@ -87,7 +90,7 @@ def _bits(x: NDArray[np.bool_]) -> str:
     return "".join("1" if bit else "0" for bit in x.tolist())
 
 
-def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> None:
+def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> Answer:
     """Write solution and picture, then print table and paths; the table is printed even if writing fails."""
     solver = OmegaConf.to_container(config.solver, resolve=True)
     assert isinstance(solver, dict)
@@ -112,6 +115,7 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
         say(f"Trajectory:  {short_path(picture)}, .svg")
     if lost:
         raise UserError(lost)
+    return answer
 
 
 def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.arrays import double
+from memcomp_lightning.problems.constrained import Constrained, clause
 from memcomp_lightning.problems.files.numbers import LARGEST_INT64, Exact, Numbers, in_full
 from memcomp_lightning.problems.files.source import Source
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
@@ -71,6 +72,7 @@ class Parsed:
         integers: ``problem`` as integers, in units of its numbers' last digit, for solvers that prove; None where
             int64 does not hold its sums, or for clauses of three literals and more.
         resolved: Whether float64 tells apart all energies that differ.
+        constrained: ``problem`` with its hard clauses apart, for solvers that prove nothing; None without any.
     """
 
     problem: Qubo | WeightedMaxSat
@@ -80,6 +82,7 @@ class Parsed:
     remarks: tuple[str, ...] = ()
     integers: Qubo | None = None
     resolved: bool = True
+    constrained: Constrained | None = None
 
 
 # ------------------------------------------------------------------------------------------ terms of two variables
@@ -266,7 +269,12 @@ def from_clauses(
     listed = ClauseList(flat, np.repeat(np.arange(len(clauses)), lengths), soft, is_hard)
     objective = Objective(name, listed, penalty=soft.exact(penalty))
     resolved = _resolved(size, soft.decimals, len(clauses))
-    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved)
+    constrained = None
+    if any(hard):
+        clauses_, weights_ = list(compress(renamed, ~is_hard)), list(compress(weights, ~is_hard))
+        soft_alone = WeightedMaxSat.from_clauses(len(used), clauses_, weights_)
+        constrained = Constrained.of(soft_alone, [clause(found) for found in compress(renamed, is_hard)])
+    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved, constrained)
 
 
 def _penalty(total: int, one: int) -> int:
