@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from memcomp_lightning import compiling
 from memcomp_lightning.arrays import Array, add_up, alike, as_array, double, namespace, to_numpy
 from memcomp_lightning.errors import require_count, require_parts
 from memcomp_lightning.problems.constrained import Constrained, sums_of
-from memcomp_lightning.problems.maxsat import WeightedMaxSat, as_qubo, to_qubo
+from memcomp_lightning.problems.maxsat import as_qubo, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
 from memcomp_lightning.solvers.compiled import Numbers
@@ -29,7 +29,7 @@ class PenaltyLoop:
     (:func:`local_penalties`): a larger one hides the objective. Where an answer with broken constraints has less
     energy than the best without, these constraints cost too little: their penalties double, and the next round
     begins. Where no round found an answer that keeps all constraints, the last one takes penalties with which
-    breaking one never pays.
+    breaking one never pays; so it does for a solver that proves its minima.
 
     Attributes:
         solver: The solver.
@@ -53,8 +53,6 @@ class PenaltyLoop:
         rows, penalties, safe = problem.constraints, local_penalties(problem), safe_penalty(problem)
         found, lowest = list[QuboSolution](), np.full(problem.objective.problems, np.inf)
         for k in range(self.n_rounds):
-            if k and k == self.n_rounds - 1:
-                penalties = np.where(np.isinf(lowest)[..., None], safe, penalties)
             given = problem.penalised(as_array(penalties))
             if not getattr(self.solver, "takes_clauses", False):
                 given = as_qubo(given)
@@ -71,6 +69,9 @@ class PenaltyLoop:
             if not too_cheap.any():
                 break
             penalties = np.where(too_cheap, np.minimum(2 * penalties, safe), penalties)
+            if k == self.n_rounds - 2:
+                proves = to_numpy(solution.status == int(Status.OPTIMAL)).all(-1)
+                penalties = np.where((np.isinf(lowest) | proves)[..., None], safe, penalties)
         concat = namespace(found[0].energies).concat
         return QuboSolution(
             assignments=concat([solution.assignments for solution in found], axis=-2),
@@ -94,11 +95,13 @@ def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: 
     """
     xp, x, was_run = namespace(raw), repair(problem, raw), solution.energies < namespace(raw).inf
     broken = xp.where(was_run, problem.n_broken(x), len(problem.constraints))
+    energies = xp.where(was_run, problem.energy(x), xp.inf)
     proven = solution.status == int(Status.OPTIMAL)
-    status = xp.where(proven & (problem.n_broken(raw) > 0), int(Status.CONVERGED), solution.status)
+    # The lowest energy with penalties is no higher than that of any state that keeps all constraints.
+    short_of = (problem.n_broken(raw) > 0) & (energies > solution.energies)
+    status = xp.where(proven & short_of, int(Status.CONVERGED), solution.status)
     status = xp.where(was_run & (broken > 0), int(Status.NOT_FEASIBLE), status)
     status = xp.where(proven & hopeless, int(Status.INFEASIBLE), status)
-    energies = xp.where(was_run, problem.energy(x), xp.inf)
     return replace(solution, assignments=x, energies=energies, status=status, broken=broken)
 
 
@@ -108,33 +111,32 @@ _LEAST = 1e-9
 
 def safe_penalty(problem: Constrained) -> Numbers:
     """A penalty with which no state that breaks a constraint is a minimum, ``(*problems, 1)``."""
-    return _power_of_two_above(np.add(*_largest_changes(problem.objective)).sum(-1, keepdims=True))
+    return _power_of_two_above(_fields(problem).most.sum(-1, keepdims=True))
 
 
 def local_penalties(problem: Constrained) -> Numbers:
-    """What breaking each constraint can gain, seen from its own variables, ``(*problems, n_constraints)``.
+    """What breaking each constraint may gain, seen from its own variables, ``(*problems, n_constraints)``.
 
-    Whoever mends a broken constraint flips one of its variables, which raises the objective by no more than all
-    that pulls at this variable; the cheapest one counts. Where the flip may break another constraint, about the
-    mean of such pulls is added.
+    Whoever mends a broken constraint flips one of its variables, which costs the objective its field: about the
+    mean over random states and half of the standard deviation. The cheapest flip counts. Where it may break
+    another constraint, about a quarter of what flips cost on the average is added.
     """
-    rows, (on, off) = problem.constraints, _largest_changes(problem.objective)
-    most = np.maximum(on, off)
-    n_pulled = (most > 0).sum(-1, keepdims=True)
-    typical = _power_of_two_above(most.sum(-1, keepdims=True) / np.maximum(n_pulled, 1)) / 2
-    row, x, rises = rows.row, rows.variables, rows.coefficients > 0
-    filled = rows.lengths > 0
+    rows, fields = problem.constraints, _fields(problem)
+    on, off = (np.maximum(sign * fields.mean + fields.deviation / 2, 0) for sign in (1, -1))
+    dear = np.maximum(on, off)
+    mean = dear.sum(-1, keepdims=True) / np.maximum((dear > 0).sum(-1, keepdims=True), 1)
+    extra = _power_of_two_above(mean) / 4
+    row, x, rises, filled = rows.row, rows.variables, rows.coefficients > 0, rows.lengths > 0
     from_above = rows.upper < sums_of(np.maximum(rows.coefficients, 0), rows.begins)
-    hurts_on, hurts_off = ~rises | from_above[row], rises | from_above[row]
     costs = []
-    for change, hurts in ((on, hurts_on), (off, hurts_off)):
-        others = np.bincount(x, hurts, minlength=problem.n)[x] - hurts
-        costs.append(change[..., x] + typical * (others > 0))
+    for flip, hurts in ((on, ~rises | from_above[row]), (off, rises | from_above[row])):
+        hurts_others = np.bincount(x, hurts, minlength=problem.n)[x] > hurts
+        costs.append(flip[..., x] + extra * hurts_others)
     penalties = np.zeros((*problem.objective.problems, len(rows)))
-    for raises, wanted in ((rises, filled), (~rises, filled & from_above)):
-        cheapest = np.minimum.reduceat(np.where(raises, *costs), rows.begins[:-1][filled], axis=-1)
-        penalties[..., wanted] = np.maximum(penalties[..., wanted], cheapest[..., wanted[filled]])
-    return np.minimum(np.where(penalties > 0, penalties, typical), safe_penalty(problem))
+    for sums_rise, of_rows in ((rises, filled), (~rises, filled & from_above)):
+        cheapest = np.minimum.reduceat(np.where(sums_rise, *costs), rows.begins[:-1][filled], axis=-1)
+        penalties[..., of_rows] = np.maximum(penalties[..., of_rows], cheapest[..., of_rows[filled]])
+    return np.minimum(np.where(penalties > 0, penalties, extra), safe_penalty(problem))
 
 
 def _power_of_two_above(x: Numbers) -> Numbers:
@@ -142,15 +144,35 @@ def _power_of_two_above(x: Numbers) -> Numbers:
     return np.exp2(np.frexp(x)[1])
 
 
-def _largest_changes(objective: Qubo | WeightedMaxSat) -> tuple[Numbers, Numbers]:
-    """What turning each variable on, and off, adds to the objective at most, ``(*problems, n)`` each, >= 0."""
+class _Fields(NamedTuple):
+    """Of the objective at x_i = 1 less that at x_i = 0, ``(*problems, n)``: over random states, and its size."""
+
+    mean: Numbers
+    deviation: Numbers
+    most: Numbers
+
+
+def _fields(problem: Constrained) -> _Fields:
+    """Fields where each variable is 1 half of the time, or as seldom as one of its constraints asks for."""
+    objective, rows, n = problem.objective, problem.constraints, problem.n
+    most, least = (sums_of(clip(rows.coefficients, 0), rows.begins) for clip in (np.maximum, np.minimum))
+    limit = np.where(least == 0, rows.upper / np.maximum(most, 1), 0.5)
+    limit = np.where(most == 0, rows.lower / np.minimum(least, -1), limit)
+    share = np.full(n, 0.5)
+    np.minimum.at(share, rows.variables, limit.clip(0, 0.5)[rows.row])
     short = objective if isinstance(objective, Qubo) else to_qubo(objective.without_longer())
     graph, coupling, linear = short.graph, double(short.coupling), double(short.linear)
-    above, below = (linear + graph.scatter(part, part) for part in (coupling.clip(min=0), coupling.clip(max=0)))
-    on, off = to_numpy(above).clip(min=0), -to_numpy(below).clip(max=0)
+    p, q = graph.gather(alike(share, linear))
+    mean = linear + graph.scatter(coupling * q, coupling * p)
+    variance = graph.scatter(coupling**2 * (q * (1 - q)), coupling**2 * (p * (1 - p)))
+    size = abs(linear) + graph.scatter(abs(coupling), abs(coupling))
     for block in () if isinstance(objective, Qubo) else objective.longer:
-        for change, polarity in ((on, -1), (off, 1)):
-            pull = double(block.weight)[..., None] * (block.polarity == polarity)
-            flat = pull.reshape(*pull.shape[:-2], -1)
-            change += to_numpy(add_up(flat, block.variables.reshape(-1), objective.n))
-    return on, off
+        weight, variables = double(block.weight)[..., None], block.variables.reshape(-1)
+        decisive = 2.0 ** (1 - block.variables.shape[1])  # how often all other literals are false
+        spread = decisive * (1 - decisive) * weight
+        of_literals = (-decisive * block.polarity, spread * abs(block.polarity), abs(block.polarity))
+        each = [(weight * part).reshape(*objective.problems, -1) for part in of_literals]
+        mean, variance, size = (
+            total + add_up(part, variables, n) for total, part in zip((mean, variance, size), each, strict=True)
+        )
+    return _Fields(*(to_numpy(part) for part in (mean, variance**0.5, size)))
