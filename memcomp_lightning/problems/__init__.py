@@ -35,4 +35,4 @@ __all__ = [
     "to_qubo",
 ]
 
-__getattr__ = on_demand(__name__, {"from_bqm": "bqm", "to_bqm": "bqm"})
+__getattr__ = on_demand(__name__, {"from_bqm": "bqm", "from_cqm": "cqm", "to_bqm": "bqm"})

@@ -1,5 +1,6 @@
 """Problems with constraints: hard clauses, exactly k of some variables, sums of whole numbers with bounds."""
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -60,8 +61,9 @@ def clause(literals: Iterable[int]) -> Linear:
 class Constraints:
     """Rows ``lower <= a . x <= upper`` of whole numbers, one after another.
 
-    A row that bounds its sum from above alone is kept with its signs changed, and bounds that no state passes are
-    the smallest and the largest sum.
+    A row that bounds its sum from above alone is kept with its signs changed, a common factor of the coefficients
+    is left out, and bounds that no state passes are the smallest and the largest sum. Where no sum lies within the
+    bounds, they are one above the largest.
 
     Attributes:
         begins: Where the variables of each row begin, ``(n_rows + 1,)`` int64.
@@ -98,11 +100,14 @@ class Constraints:
                 (dict(coefficients), lower, upper),
                 "whole numbers, and coefficients whose sizes add up to less than 2^31",
             )
-            row = sorted((variable, int(a)) for variable, a in coefficients.items() if a)
+            unit = math.gcd(*map(int, coefficients.values())) or 1
+            row = sorted((variable, int(a) // unit) for variable, a in coefficients.items() if a)
             least, most = sum(min(a, 0) for _, a in row), sum(max(a, 0) for _, a in row)
-            low = least if lower is None else min(max(int(lower), least), most + 1)
-            high = most if upper is None else max(min(int(upper), most), least - 1)
-            if low == least and high < most:
+            low = least if lower is None else max(-(-int(lower) // unit), least)
+            high = most if upper is None else min(int(upper) // unit, most)
+            if low > high:
+                low = high = most + 1
+            elif low == least and high < most:
                 row, low, high = [(variable, -a) for variable, a in row], -high, -low
             lengths.append(len(row))
             entries += row
