@@ -9,6 +9,8 @@ from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
 from memcomp_lightning.solvers.constrained import PenaltyLoop
+from memcomp_lightning.solvers.found import Found, State
+from memcomp_lightning.solvers.search import Search
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 __all__ = [
@@ -16,12 +18,15 @@ __all__ = [
     "Answer",
     "BranchAndBound",
     "BruteForce",
+    "Found",
     "GibbsAnnealing",
     "PenaltyLoop",
     "Portfolio",
     "QuboSolution",
     "QuboSolver",
     "RecordedStates",
+    "Search",
+    "State",
     "Status",
     "TabuSearch",
     "write_solution",

@@ -32,6 +32,7 @@ class Status(IntEnum):
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
     NOT_FEASIBLE = 8, "No assignment that keeps all constraints was found; more restarts may find one."
+    AGREED = 9, "Not proven, but many independent restarts reached this energy and none went below it."
 
 
 class RecordedStates(Protocol):

@@ -215,6 +215,34 @@ def test_every_combination_in_a_multirun(memcomp_solve: Solve) -> None:
     assert len(list(Path("all").glob("*/solution.json"))) == 4
 
 
+def test_a_search_keeps_time_states_and_curve(memcomp_solve: Solve) -> None:
+    pairs = "".join(f"{i} {j} {(7 * i + 3 * j) % 11 - 5}\n" for i in range(1, 31) for j in range(1, i))
+    Path("cut.txt").write_text(f"30 435\n{pairs}")
+    best = ["solver=best", "hydra.run.dir=run"]
+    outcome = memcomp_solve("problem=cut.txt", *best, "n_solutions=4", "min_distance=2")
+    assert outcome.status == 0, outcome.err
+    for part in ("AGREED", "lower bound", "no state has a lower energy", "solutions", "4, energies up to -"):
+        assert part in outcome.out
+    found = json.loads(Path("run/solution.json").read_text())
+    assert found["status"] == "AGREED"
+    assert found["lower_bound"] <= found["energy"] == found["curve"][-1][1]
+    x = np.array([found["assignment"], *(other["assignment"] for other in found["other_solutions"])])
+    assert len(x) == 4
+    assert all((x[i] != x[j]).sum() >= 2 for i in range(4) for j in range(i))
+    energies = [found["energy"], *(other["energy"] for other in found["other_solutions"])]
+    problem = read_problem("cut.txt")
+    assert energies == sorted(energies) == problem.problem.energy(x).tolist()
+    Path("start.txt").write_text("\n".join(map(str, found["assignment"])))
+    for start in ("run/solution.json", "start.txt"):
+        target = f"target={found['objective']['value']}"
+        outcome = memcomp_solve("problem=cut.txt", f"initial={start}", target, best[0], "hydra.run.dir=again")
+        assert outcome.status == 0, outcome.err
+        again = json.loads(Path("again/solution.json").read_text())
+        assert (again["assignment"], again["restarts"]["energy"]) == (found["assignment"], [])
+    outcome = memcomp_solve("problem=cut.txt", *best, "time_limit=0.2", "solver.effort=0.1")
+    assert len(json.loads(Path("run/solution.json").read_text())["restarts"]["energy"]) > 28
+
+
 REFUSED = {
     "": ["problem=FILE is missing", "memcomp-solve problem=G1.txt", "beasley", "--help"],
     "problem=": ["problem=FILE is missing"],
@@ -233,6 +261,12 @@ REFUSED = {
     "problem=ring.txt maximise=1": ["maximise = 1", "true or false"],
     "problem=pairs.wcnf maximise=true": ["maximise = True", "false for a file of format 'wcnf'"],
     "problem=ring.txt seed=1.5": ["seed = 1.5", "an integer"],
+    "problem=ring.txt time_limit=0": ["time_limit = 0", "seconds > 0"],
+    "problem=ring.txt target=far": ["target = 'far'", "a finite number"],
+    "problem=ring.txt n_solutions=0": ["n_solutions = 0"],
+    "problem=ring.txt initial=none.json": ["initial=none.json cannot be read"],
+    "problem=ring.txt initial=ring.txt": ["shape of initial"],
+    "problem=ring.txt initial=rbm.npz": ["initial=rbm.npz holds no state", "zeros and ones"],
     "problem=ring.txt +keep=1": ["setting = 'keep'", "'problem'"],
     "problem=ring.txt model=dbn": ["'model'"],
     "problem=ring.txt hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import compress, pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,11 @@ class Terms:
     j: NDArray[np.int64]
     numbers: Numbers
 
+    @property
+    def unit(self) -> float:
+        """Sums are multiples of it."""
+        return float(10.0**-self.numbers.decimals)
+
     def count(self, x: Bits) -> Score:
         """The sum, without rounding."""
         values, constant = self.numbers.integers[:-1], int(self.numbers.integers[-1])
@@ -130,10 +135,10 @@ def from_terms(
     size = 9 * numbers.total  # a pair of spins: 4 x_i x_j - 2 x_i - 2 x_j + 1
     integers = None
     if numbers.integers.dtype != object:  # energies fit: sums on the way that overflow wrap round, and back again
-        integers = _as_qubo(terms, len(used), sign * numbers.integers)
+        integers = sum_as_qubo(terms.kind, len(used), i, j, sign * numbers.integers)
     _check_size(source, numbers.exact(size))
     if integers is None or size > LARGEST_INT64 or numbers.decimals > 22:  # 10^22 is the last that float64 holds
-        problem = _as_qubo(terms, len(used), sign * numbers.double())
+        problem = sum_as_qubo(terms.kind, len(used), i, j, sign * numbers.double())
     else:
         parts = (integers.coupling, integers.linear, integers.offset)
         size = sum(int(abs(part).sum()) for part in parts)
@@ -144,14 +149,20 @@ def from_terms(
     return Parsed(problem, objective, n, used.astype(np.int64), tuple(said), integers, resolved)
 
 
-def _as_qubo(terms: Terms, n: int, values: NDArray[Any]) -> Qubo:
-    """The sum as a QUBO of the same dtype as the values; the last of these is a constant."""
-    i, j, v, constant = terms.i, terms.j, values[:-1], values[-1]
-    if terms.kind == "product":
+def sum_as_qubo(
+    kind: Literal["product", "cut", "spin"],
+    n: int,
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    values: NDArray[Any],
+) -> Qubo:
+    """Such a sum as :class:`Terms` is, as a QUBO of the same dtype as the values; the last of these is added."""
+    v, constant = values[:-1], values[-1]
+    if kind == "product":
         return Qubo.from_coo(n, i, j, v, constant)
     own = i == j
     (a, b, w), (k, h) = (t[~own] for t in (i, j, v)), (t[own] for t in (i, v))
-    if terms.kind == "cut":
+    if kind == "cut":
         return Qubo.from_coo(
             n, np.concatenate((a, a, b)), np.concatenate((b, a, b)), np.concatenate((-2 * w, w, w)), constant
         )
@@ -229,6 +240,11 @@ class ClauseList:
     weight: Numbers
     hard: Bits
 
+    @property
+    def unit(self) -> float:
+        """Sums are multiples of it."""
+        return float(10.0**-self.weight.decimals)
+
     def count(self, x: Bits) -> Score:
         """Weight of the unsatisfied soft clauses, number of the unsatisfied hard ones."""
         true = x[np.abs(self.literals) - 1] == (self.literals > 0)
@@ -300,6 +316,7 @@ class RbmEnergy:
         c: ``(n_hidden,)``.
     """
 
+    unit: ClassVar[None] = None
     weight: NDArray[np.float64]
     b: NDArray[np.float64]
     c: NDArray[np.float64]
