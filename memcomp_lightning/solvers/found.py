@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from memcomp_lightning.problems.files.numbers import Exact
-from memcomp_lightning.solvers.base import RecordedStates, Status
+from memcomp_lightning.solvers.base import QuboSolution, RecordedStates, Status
 
 PROVEN = (Status.OPTIMAL, Status.INFEASIBLE, Status.ROUNDED)
 """How a search of all states ends: another one would end likewise."""
@@ -46,6 +46,7 @@ class Found:
         lower_bound: No state has a lower energy; minus infinity where none is known.
         resolution: Energies that differ by no more are the same.
         wall_time_s: Seconds in all.
+        last: What the last round returned; None if none came to its end.
         interrupted: Whether Ctrl-C ended the search.
         trajectory: What the first round passed through, if its solver was asked to record it.
     """
@@ -59,6 +60,7 @@ class Found:
     lower_bound: float = -math.inf
     resolution: float = 0.0
     wall_time_s: float = 0.0
+    last: QuboSolution | None = None
     interrupted: bool = False
     trajectory: RecordedStates | None = None
 

@@ -154,6 +154,7 @@ class _Record:
         self._energies, self._status, self._steps = list[Exact | float | None](), list[Status](), list[int]()
         self._broken = list[int]()
         self._trajectory: RecordedStates | None = None
+        self._last: QuboSolution | None = None
         self.states: list[State] = []
 
     @property
@@ -178,6 +179,7 @@ class _Record:
             lower_bound=self._lower_bound,
             resolution=self._resolution,
             wall_time_s=self.seconds,
+            last=self._last,
             trajectory=self._trajectory,
         )
         proven = found.conclusion is Status.OPTIMAL
@@ -196,7 +198,7 @@ class _Record:
         self._broken += broken
         self._status += status
         self._steps += solution.steps.tolist()
-        self._trajectory = self._trajectory or solution.trajectory
+        self._trajectory, self._last = self._trajectory or solution.trajectory, solution
         x = to_numpy(solution.assignments) > 0.5
         each = enumerate(zip(energies, broken, strict=True))
         self._offer([(n_broken, energy, x[k]) for k, (energy, n_broken) in each if energy is not None])
