@@ -31,7 +31,7 @@ def eliminated(qubo: Qubo) -> Bits | None:
     own = to_numpy(qubo.linear).tolist()
     around: list[dict[int, float]] = [{} for _ in range(n)]
     for (i, j), q in zip(to_numpy(qubo.graph.edges())[used].tolist(), coupling[used].tolist(), strict=True):
-        around[i][j] = around[j][i] = q
+        around[i][j] = around[j][i] = around[i].get(j, 0) + q  # a pair may be listed twice
     order = list[tuple[int, float, list[tuple[int, float]]]]()
     waiting, done = [i for i in range(n) if len(around[i]) <= 2], [False] * n
     while waiting:

@@ -25,7 +25,7 @@ from memcomp_lightning.solvers.best import MOST_ENUMERATED, Portfolio
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.solvers.found import PROVEN, Found, State
 from memcomp_lightning.solvers.proofs import RoofDual, eliminated, parts_of, roof_dual, rounding
-from memcomp_lightning.solvers.solving import Given, integers_of, minimise, numbers_of
+from memcomp_lightning.solvers.solving import Given, minimise, numbers_of
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 Bits = NDArray[np.bool_]
@@ -239,13 +239,11 @@ class _Record:
         """Look for a proof that takes little time, and else for a lower bound."""
         if self._qubo.n == 0 or isinstance(self._problem, Constrained):
             return
-        exact = integers_of(self._problem)
-        qubo = self._qubo if exact is None else exact
-        minimum = eliminated(qubo)
+        minimum = eliminated(self._qubo)
         if minimum is None and (dual := self.bound()) is not None:
-            qubo, minimum = self._qubo, dual.minimum
+            minimum = dual.minimum
         if minimum is not None:
-            self.add(_proven(qubo, minimum, self._given.n))
+            self.add(_proven(self._qubo, minimum, self._given.n))
 
     def bound(self) -> RoofDual | None:
         """Look for a lower bound, unless there is one, or the problem is small enough to be enumerated."""

@@ -31,10 +31,10 @@ def minimise(problem: Given, solver: QuboSolver, generator: "Generator") -> Qubo
     if given.n == 0:
         return BruteForce().minimise(as_qubo(given), generator=generator)
     try:
-        if isinstance(solver, BruteForce) and isinstance(problem, Problem):
-            exact = integers_of(problem)
-            return solver.minimise(as_qubo(given) if exact is None else exact, generator=generator)
-        if constrained is not None:
+        proves = isinstance(solver, BruteForce) and isinstance(problem, Problem)
+        if proves and isinstance(problem, Problem) and problem.integers is not None and not problem.resolved:
+            return solver.minimise(problem.integers, generator=generator)
+        if constrained is not None and not proves:
             return PenaltyLoop(solver=solver).minimise(constrained, generator=generator)
         if getattr(solver, "takes_clauses", False):
             return solver.minimise(given, generator=generator)  # type: ignore[arg-type]
@@ -59,11 +59,6 @@ def constrained_of(problem: Given) -> Constrained | None:
     if isinstance(problem, Problem):
         return problem.constrained
     return problem if isinstance(problem, Constrained) else None
-
-
-def integers_of(problem: Given) -> Qubo | None:
-    """The problem as integers, for a proof, where float64 does not tell apart all energies and int64 does."""
-    return problem.integers if isinstance(problem, Problem) and not problem.resolved else None
 
 
 def check_memory(problem: Given, solver: QuboSolver) -> None:

@@ -16,12 +16,12 @@ from memcomp_lightning.solvers import (
     BruteForce,
     GibbsAnnealing,
     Portfolio,
+    Search,
     Status,
     TabuSearch,
     write_solution,
 )
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver
-from memcomp_lightning.solvers.solving import minimise
 
 SOLVERS = {
     "brute force": BruteForce(),
@@ -56,7 +56,7 @@ SIZES = [
 
 def answer_of(name, problem, seed):
     """What a solver finds, as ``memcomp-solve`` asks it."""
-    return Answer.of(problem, minimise(problem, SOLVERS[name], seed))
+    return Answer.of(problem, Search().run(problem, SOLVERS[name], seed=seed))
 
 
 def random_formula(seed):

@@ -7,7 +7,7 @@ import pytest
 
 from memcomp_lightning import rng
 from memcomp_lightning.enumeration import binary_states
-from memcomp_lightning.problems import Qubo
+from memcomp_lightning.problems import EdgeList, Qubo
 from memcomp_lightning.solvers import proofs
 from memcomp_lightning.solvers.proofs import eliminated, roof_dual
 
@@ -61,6 +61,13 @@ def test_what_does_not_come_apart_is_left_alone():
     assert eliminated(problem(pairs_of_treewidth(3, generator), generator)) is None
     complete = [(i, j) for i in range(4) for j in range(i)]  # few pairs, but four variables that all meet
     assert eliminated(problem(complete, generator)) is None
+
+
+def test_pairs_that_are_listed_twice_add_up():
+    twice = EdgeList(n=3, pairs=np.array([[0, 1], [0, 1], [1, 2]]))
+    qubo = Qubo(twice, np.array([5.0, -4.0, -1.5]), np.array([-2.0, 0.5, 0.0]), np.array(0.0))
+    lowest = qubo.energy(binary_states(3, like=qubo.linear)).min()
+    assert qubo.energy(eliminated(qubo)[None].astype(float)) == lowest
 
 
 def test_integers_beyond_float64_are_not_rounded():
