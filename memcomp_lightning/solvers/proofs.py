@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.arrays import Array, to_numpy
+from memcomp_lightning.arrays import Array, alike, cast, to_numpy
 from memcomp_lightning.problems.maxsat import WeightedMaxSat
 from memcomp_lightning.problems.qubo import Qubo
 
@@ -63,7 +63,7 @@ class RoofDual(NamedTuple):
 
     Attributes:
         lower_bound: No state has a lower energy.
-        minimum: A state of lowest energy ``(n,)``, where the roof dual decides all variables.
+        minimum: A state of this energy ``(n,)``, where the roof dual decides all variables and meets its bound.
     """
 
     lower_bound: float
@@ -88,10 +88,13 @@ def roof_dual(qubo: Qubo) -> RoofDual | None:
     except ModuleNotFoundError:  # the extra [dimod] is not installed
         return None
     bound, fixed = roof_duality(to_bqm(qubo), strict=False)
-    bound = float(bound) - rounding(parts_of(qubo))
-    if len(fixed) < qubo.n:
-        return RoofDual(bound, None)
-    return RoofDual(bound, np.array([fixed[i] for i in range(qubo.n)], np.bool_))
+    error, minimum = rounding(parts_of(qubo)), None
+    if len(fixed) == qubo.n:
+        minimum = np.array([fixed[i] for i in range(qubo.n)], np.bool_)
+        x = cast(alike(minimum[None], qubo.linear), qubo.linear.dtype)
+        if float(qubo.energy(x)[0]) > bound + 2 * error:  # values of separate parts need not suit each other
+            minimum = None
+    return RoofDual(float(bound) - error, minimum)
 
 
 def parts_of(problem: Qubo | WeightedMaxSat) -> list[Array]:

@@ -96,6 +96,15 @@ def test_the_roof_dual_bounds_and_decides():
     assert n_open
 
 
+def test_a_state_that_does_not_meet_the_bound_is_no_minimum(monkeypatch):
+    """dwave-preprocessing may fix all variables to values that are each part of a minimum, but not of the same."""
+    preprocessing = pytest.importorskip("dwave.preprocessing")
+    monkeypatch.setattr(preprocessing, "roof_duality", lambda bqm, strict: (-1.0, {0: 0, 1: 0}))
+    dual = roof_dual(Qubo.from_matrix(np.array([[-1.0, 2.0], [0.0, -1.0]])))
+    assert dual.lower_bound == pytest.approx(-1.0)
+    assert dual.minimum is None
+
+
 def test_without_its_package_or_of_many_couplings_there_is_no_roof_dual(monkeypatch):
     generator = rng.numpy_stream(0, "roof")
     qubo = problem(pairs_of_treewidth(2, generator), generator)
