@@ -84,10 +84,10 @@ def solve(
 
     Args:
         problem: A square matrix Q of numpy, scipy.sparse or torch, or a dict ``{(i, j): q}``: minimise x'Qx over x
-            in {0, 1}. A pair ``(h, J)``: h . s + sum J_ij s_i s_j over spins s in {-1, 1}. A model of dimod. A
-            networkx graph: its largest cut, by the edges' ``weight``. An RBM: its ground state (v, h). The path
-            of a file that ``memcomp-solve`` reads, or what ``read_problem`` returns. A ``Qubo``, a
-            ``WeightedMaxSat``.
+            in {0, 1}. A pair ``(h, J)``: h . s + sum J_ij s_i s_j over spins s in {-1, 1}. A model of dimod,
+            with constraints or without. A networkx graph: its largest cut, by the edges' ``weight``. An RBM: its
+            ground state (v, h). The path of a file that ``memcomp-solve`` reads, or what ``read_problem`` returns.
+            A ``Qubo``, ``WeightedMaxSat`` or ``Constrained``.
         solver: A key of :data:`SOLVERS`, or a solver with settings, such as ``TabuSearch(n_restarts=100)``.
         seed: Of the random stream. The same seed gives the same answer, if there is no time limit.
         time_limit: Seconds, > 0, those of compilation not counted; None is one call of the solver.

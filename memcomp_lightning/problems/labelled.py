@@ -33,13 +33,13 @@ class Labelled:
     Attributes:
         problem: What to minimise.
         labels: Of the variables; None where states are arrays.
-        spins: Whether values are -1 and 1, and not 0 and 1.
+        spins: Whether values are -1 and 1, and not 0 and 1; of all variables, or of each, ``(n,)`` bool.
         maximised: Whether what is counted there is minus the energy.
     """
 
     problem: Problem | Constrained | Qubo | WeightedMaxSat
     labels: list[Hashable] | None = None
-    spins: bool = False
+    spins: bool | Bits = False
     maximised: bool = False
 
     @staticmethod
@@ -66,6 +66,12 @@ class Labelled:
 
             problem, labels = from_bqm(given)
             return Labelled(problem=problem, labels=labels, spins=given.vartype.name == "SPIN")
+        if hasattr(given, "constraints") and hasattr(given, "objective"):
+            from memcomp_lightning.problems.cqm import from_cqm
+
+            constrained, labels = from_cqm(given)
+            spins = np.array([given.vartype(label).name == "SPIN" for label in labels])
+            return Labelled(problem=constrained, labels=labels, spins=spins)
         if hasattr(given, "is_directed") and hasattr(given, "edges"):
             return _of_graph(given)
         return Labelled(problem=_of_matrix(given))
@@ -74,7 +80,7 @@ class Labelled:
         """A state of the problem as it is written there."""
         if isinstance(self.problem, Problem):
             x = self.problem.expand(as_array(x))
-        values = 2 * x.astype(np.int64) - 1 if self.spins else x.astype(np.int64)
+        values = np.where(self.spins, 2 * x.astype(np.int64) - 1, x.astype(np.int64))
         return values if self.labels is None else dict(zip(self.labels, values.tolist(), strict=True))
 
     def read(self, states: Any) -> Bits:
@@ -83,7 +89,7 @@ class Labelled:
         Raises:
             SettingError: Labels, lengths or values are not those of the problem.
         """
-        name, labels, n, low = "initial", self.labels, self.problem.n, -1 if self.spins else 0
+        name, labels, n, low = "initial", self.labels, self.problem.n, np.where(self.spins, -1, 0)
         if labels is not None:
             states = [states] if isinstance(states, Mapping) else list(states)
             for state in states:
@@ -92,7 +98,8 @@ class Labelled:
             states = [[state[label] for label in labels] for state in states]
         values = np.atleast_2d(np.asarray(states))
         require(values.ndim == 2 and values.shape[1] == n, f"shape of {name}", values.shape, f"({n},) or (*, {n})")
-        require(bool(((values == low) | (values == 1)).all()), name, states, f"values in {{{low}, 1}}")
+        allowed = "values in {" + " or ".join(map(str, np.unique(low).tolist())) + ", 1}"
+        require(bool(((values == low) | (values == 1)).all()), name, states, allowed)
         x = values == 1
         return x[:, self.problem.variables] if isinstance(self.problem, Problem) else x
 

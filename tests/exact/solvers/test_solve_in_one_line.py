@@ -63,6 +63,25 @@ def of_dimod(vartype):
     return model, lambda x: 1.5 + ising(h, pairs)(x), LABELS[:-1]
 
 
+def of_cqm():
+    """Every other variable is a spin; no more than two of the bits are 1."""
+    dimod = pytest.importorskip("dimod")
+    kinds = [dimod.Spin if k % 2 == 0 else dimod.Binary for k in range(N)]
+    variables = [kind(f"v{k}") for k, kind in enumerate(kinds)]
+    cqm = dimod.ConstrainedQuadraticModel()
+    cqm.set_objective(sum(PAIRS[i, j] * variables[i] * variables[j] for i, j in np.argwhere(PAIRS)))
+    cqm.add_constraint(sum(variables[1::2]) <= 2)
+
+    labels = list(cqm.variables)
+    order = [labels.index(f"v{k}") for k in range(N)]
+
+    def energy(values):
+        x = values[..., order]
+        return np.where(x[..., 1::2].sum(-1) > 2, np.inf, np.einsum("...i,ij,...j", x, PAIRS, x))
+
+    return cqm, energy, labels
+
+
 def of_rbm():
     rbm = small_rbm(8, 5).double()
     return rbm, lambda x: rbm.energy(*torch.tensor(np.atleast_2d(x)).split([8, 5], dim=-1)).detach().numpy(), None
@@ -115,6 +134,7 @@ KINDS = {
     "multigraph": lambda: of_networkx("MultiGraph"),
     "BQM of bits": lambda: of_dimod("BINARY"),
     "BQM of spins": lambda: of_dimod("SPIN"),
+    "CQM": of_cqm,
     "RBM": of_rbm,
     "file": of_file,
     "read file": lambda: (read_problem(of_file()[0]), *of_file()[1:]),
@@ -130,11 +150,10 @@ def test_the_minimum_in_the_inputs_own_terms(kind, tmp_path, monkeypatch):
     given, energy, labels = KINDS[kind]()
     solver = "dmm" if kind == "clauses" else "best"
     found = solve(given, solver=solver, seed=3, n_solutions=3)
-    low = -1 if kind in OF_SPINS else 0
-    n = {"clauses": 7, "graph": N - 1, "multigraph": N - 1, "BQM of bits": N - 1, "BQM of spins": N - 1}.get(
-        kind, N
-    )
-    states = np.array(list(itertools.product([low, 1], repeat=n)), np.float64)
+    low = np.array([-(int(v[1:]) % 2 == 0) for v in labels]) if kind == "CQM" else -1 if kind in OF_SPINS else 0
+    n = 7 if kind == "clauses" else N if labels is None else len(labels)
+    states = np.array(list(itertools.product([0, 1], repeat=n)), np.float64)
+    states = np.where(states == 0, low, 1.0)
     for state in found.solutions:
         if labels is None:
             assert state.values.shape == (n,)
@@ -142,7 +161,7 @@ def test_the_minimum_in_the_inputs_own_terms(kind, tmp_path, monkeypatch):
         else:
             assert list(state.values) == labels
             values = np.array(list(state.values.values()))
-        assert set(values.tolist()) <= {low, 1}
+        assert ((values == low) | (values == 1)).all()
         assert energy(values.astype(np.float64)) == pytest.approx(float(state.energy), abs=1e-6)
     assert float(found.best_energy) == pytest.approx(energy(states).min(), abs=1e-6)
     assert found.solutions[0].energy == found.best_energy
