@@ -12,7 +12,7 @@ PROVEN = (Status.OPTIMAL, Status.INFEASIBLE, Status.ROUNDED)
 """How a search of all states ends: another one would end likewise."""
 
 LEAST_AGREEING, SHARE_AGREEING = 3, 1 / 3
-"""Restarts that must have reached the best energy, and their share of all, for :attr:`Status.AGREED`."""
+"""Restarts that must have reached the best energy, and their share of all, for ``AGREED``."""
 
 
 class State(NamedTuple):
@@ -76,7 +76,10 @@ class Found:
 
     @property
     def conclusion(self) -> Status:
-        """What is known of the best energy: a proof, that restarts agree, or how one ended that reached it."""
+        """What is known of the best energy: a proof, that restarts agree, or how one ended that reached it.
+
+        Descents that CONVERGED do not count as agreeing: many of them may end in the same wrong minimum.
+        """
         ends = self._ends()
         proven = next((status for status in PROVEN if status in ends), None)
         if proven is not None:
@@ -84,7 +87,8 @@ class Found:
         if not self.states[0].n_broken:
             if self.states[0].energy - self.lower_bound <= self.resolution:
                 return Status.OPTIMAL
-            if len(ends) >= max(LEAST_AGREEING, SHARE_AGREEING * self.n_run):
+            n_agreeing = len(ends) - ends.count(Status.CONVERGED)
+            if n_agreeing >= max(LEAST_AGREEING, SHARE_AGREEING * self.n_run):
                 return Status.AGREED
         return ends[0] if ends else Status.STEP_BUDGET
 
