@@ -10,7 +10,7 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.likelihood import log_partition_function
 from memcomp_lightning.problems import Qubo, from_model
-from memcomp_lightning.solvers import BranchAndBound, GibbsAnnealing, TabuSearch
+from memcomp_lightning.solvers import BranchAndBound, CrossoverAnnealing, GibbsAnnealing, TabuSearch
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.testing import small_rbm
 
@@ -27,6 +27,7 @@ def others():
     for solver in (GibbsAnnealing(n_sweeps=1), TabuSearch(n_steps=1)):
         for each in (problem, Qubo.from_matrix(torch.ones(2, 2))):
             solver.minimise(each, generator=generator)
+    CrossoverAnnealing(n_sweeps=1).minimise(Qubo.from_matrix(torch.ones(2, 2)), generator=generator)
     log_partition_function(small_rbm())
 
 

@@ -9,6 +9,7 @@ from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
 from memcomp_lightning.solvers.constrained import PenaltyLoop
+from memcomp_lightning.solvers.crossover import CrossoverAnnealing
 from memcomp_lightning.solvers.found import Found, State
 from memcomp_lightning.solvers.search import Search
 from memcomp_lightning.solvers.tabu import TabuSearch
@@ -18,6 +19,7 @@ __all__ = [
     "Answer",
     "BranchAndBound",
     "BruteForce",
+    "CrossoverAnnealing",
     "Found",
     "GibbsAnnealing",
     "PenaltyLoop",

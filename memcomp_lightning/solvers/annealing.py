@@ -12,7 +12,7 @@ from memcomp_lightning.arrays import Array, alike, cast, double, namespace, sigm
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import descend, random_states
-from memcomp_lightning.solvers.base import QuboSolution, Status
+from memcomp_lightning.solvers.base import QuboSolution
 from memcomp_lightning.solvers.compiled import (
     Layers,
     check_kernel,
@@ -24,6 +24,7 @@ from memcomp_lightning.solvers.compiled import (
     seeds,
     seen_from_variables,
     share,
+    solution_of,
     without_zeros,
 )
 
@@ -53,8 +54,8 @@ class GibbsAnnealing:
 
     n_restarts: int = 28
     n_sweeps: int = 100
-    beta_first: float = 0.4
-    beta_last: float = 12.0
+    beta_first: float = 1.5
+    beta_last: float = 5.0
     quench_every: int = 5
     kernel: Literal["auto", "compiled", "reference"] = "auto"
 
@@ -69,18 +70,11 @@ class GibbsAnnealing:
     @np.errstate(under="ignore")
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the best state of each restart."""
-        qubo = qubo.floating()
-        begin = time.perf_counter() - compiling.seconds_spent()
-        compiled = self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0
-        x = self._compiled(qubo, generator) if compiled else self._reference(qubo, generator)
-        ones = namespace(x).ones(x.shape[:-1], dtype=namespace(x).int64, device=x.device)
-        return QuboSolution(
-            assignments=x,
-            energies=qubo.energy(x),
-            status=ones * int(Status.STEP_BUDGET),
-            steps=ones * self.n_sweeps,
-            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
-        )
+        qubo, begin = qubo.floating(), time.perf_counter() - compiling.seconds_spent()
+        if self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0:
+            x, was_run, in_time = self._compiled(qubo, generator)
+            return solution_of(qubo, x, begin, steps=self.n_sweeps, was_run=was_run, in_time=in_time)
+        return solution_of(qubo, self._reference(qubo, generator), begin, steps=self.n_sweeps)
 
     @property
     def _quench_from(self) -> int:
@@ -95,14 +89,11 @@ class GibbsAnnealing:
     def _reference(self, qubo: Qubo, generator: "Generator") -> Array:
         """Plain operations on arrays."""
         xp, x, best = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator), None
-        blocks, scale = list(qubo.graph.blocks()), _scale(qubo)
-        for sweep, beta in enumerate(self._betas().tolist()):
-            beta_here = cast(beta / scale, x.dtype)[..., None, None]
-            for block in blocks:
-                p = sigmoid(-beta_here * qubo.field(x)[..., block])
-                x[..., block] = rng.bernoulli(p, generator=generator)
-            late = sweep - self._quench_from
-            if sweep + 1 == self.n_sweeps or (late >= 0 and late % self.quench_every == 0):
+        scale = scale_of(qubo)
+        for number, beta in enumerate(self._betas().tolist()):
+            sweep(qubo, x, beta / scale, generator)
+            late = number - self._quench_from
+            if number + 1 == self.n_sweeps or (late >= 0 and late % self.quench_every == 0):
                 found = xp.asarray(x, copy=True)
                 for _ in range(_DESCENTS):
                     descend(qubo, found)
@@ -114,8 +105,8 @@ class GibbsAnnealing:
         assert best is not None
         return best
 
-    def _compiled(self, qubo: Qubo, generator: "Generator") -> Array:
-        """Flips are events, see ``kernels.annealing``."""
+    def _compiled(self, qubo: Qubo, generator: "Generator") -> tuple[Array, Array, bool]:
+        """The states, which of them were run and whether all came to their end: see ``kernels.annealing``."""
         from memcomp_lightning.solvers.kernels import annealing, random
 
         problem = seen_from_variables(without_zeros(qubo))
@@ -124,18 +115,19 @@ class GibbsAnnealing:
         n_items = n_problems * -(-self.n_restarts // width)
         own_seeds = seeds(n_items, generator)
         unit = power_of_two(problem.couplings, problem.own)
-        betas = float32(self._betas() * (unit / to_numpy(_scale(qubo)).ravel())[:, None])
-        best = np.zeros((n_items, qubo.n, width), np.bool_)
+        betas = float32(self._betas() * (unit / to_numpy(scale_of(qubo)).ravel())[:, None])
+        best = np.full((n_items, qubo.n, width), -1, np.int8)
         kernel = annealing.anneal_layers if layered else annealing.anneal_pairs
         longest = qubo.n if layered else width
-        numbers = tuple(over(part, unit) if part.dtype == np.float64 else part for part in problem)
-        arguments = (numbers, betas, (self._quench_from, self.quench_every))
+        numbers = (*problem.rows(lambda part: over(part, unit)), over(problem.own, unit))
+        quench = self._quench_from, self.quench_every
         work = n_items * self.n_sweeps * width * problem.size / 10
-        share(kernel, n_items, work, (*arguments, random.thresholds(longest), own_seeds, best), (random,))
+        arguments = (numbers, betas, quench, random.thresholds(longest), own_seeds, best)
+        in_time = share(kernel, n_items, work, arguments, (random,), anytime=True)
         lanes = best.reshape(n_problems, -1, qubo.n, width).transpose(0, 1, 3, 2)
-        x = lanes.reshape(n_problems, -1, qubo.n)[:, : self.n_restarts]
-        x = x.reshape(*qubo.problems, self.n_restarts, qubo.n)
-        return cast(alike(np.ascontiguousarray(x), qubo.linear), qubo.linear.dtype)
+        states = lanes.reshape(n_problems, -1, qubo.n)[:, : self.n_restarts]
+        x = np.ascontiguousarray(states).reshape(*qubo.problems, self.n_restarts, qubo.n)
+        return cast(alike(x > 0, qubo.linear), qubo.linear.dtype), alike(x[..., 0] >= 0, qubo.linear), in_time
 
 
 _HOT = 0.3
@@ -145,7 +137,14 @@ _DESCENTS = 4
 """Sweeps of a descent of the reference: what is left changes little."""
 
 
-def _scale(qubo: Qubo) -> Array:
+def sweep(qubo: Qubo, x: Array, beta: Array, generator: "Generator") -> None:
+    """Draw each block of ``x`` in turn given the rest at inverse temperatures ``(*problems,)``, in place."""
+    for block in qubo.graph.blocks():
+        p = sigmoid(-cast(beta, x.dtype)[..., None, None] * qubo.field(x)[..., block])
+        x[..., block] = rng.bernoulli(p, generator=generator)
+
+
+def scale_of(qubo: Qubo) -> Array:
     """Root mean square over the variables of the norm of their spin couplings, ``(*problems,)``."""
     power = (double(qubo.coupling) / 4) ** 2
     scale = qubo.graph.scatter(power, power).mean(-1) ** 0.5

@@ -1,7 +1,7 @@
 """What every solver of a QUBO takes and gives back, and how each restart ended."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
 
@@ -26,13 +26,17 @@ class Status(IntEnum):
     OPTIMAL = 0, "Proven: no state has a lower energy."
     CONVERGED = 1, "No block of variables improves this assignment; more restarts may find a lower one."
     STEP_BUDGET = 2, "The best assignment came long before the last step; more restarts may find a lower one."
-    STILL_IMPROVING = 3, "The best assignment came in the last tenth of the steps: raise max_steps."
-    NOT_RUN = 4, "Not run: enough restarts before it had found nothing better."
+    STILL_IMPROVING = (
+        3,
+        "The best assignment came in the last tenth of the steps: more steps may find a lower one.",
+    )
+    NOT_RUN = 4, "Not run: enough restarts before it had found nothing better, or no time was left."
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
     NOT_FEASIBLE = 8, "No assignment that keeps all constraints was found; more restarts may find one."
-    AGREED = 9, "Not proven, but many independent restarts reached this energy and none went below it."
+    STOPPED = 9, "The time was up, or Ctrl-C came: a longer search may find a lower one."
+    AGREED = 10, "Not proven, but many independent restarts reached this energy and none went below it."
 
 
 class RecordedStates(Protocol):
@@ -59,6 +63,8 @@ class QuboSolution:
         trajectory: What the solver passed through, if it was asked to record it.
         broken: Number of constraints that each assignment breaks, ``(*problems, n_restarts)`` int64; None where
             the problem has none.
+        population: Number of the population of each restart, ``(*problems, n_restarts)`` int64: those of one are
+            not independent. None where each is on its own.
     """
 
     assignments: Array
@@ -68,6 +74,7 @@ class QuboSolution:
     wall_time_s: float
     trajectory: RecordedStates | None = None
     broken: Array | None = None
+    population: Array | None = None
 
     @property
     def best_energy(self) -> Array:
@@ -89,6 +96,19 @@ class QuboSolution:
         xp = namespace(self.energies)
         fewest = xp.min(self.broken, axis=-1)[..., None]
         return xp.where(self.broken == fewest, self.energies, xp.inf)
+
+    def lowest(self, n: int) -> "QuboSolution":
+        """The ``n`` restarts of lowest energy of each problem, lowest first, or all if they are fewer."""
+        xp, order = namespace(self.energies), namespace(self.energies).argsort(self.energies, axis=-1)[..., :n]
+        places = xp.broadcast_to(order[..., None], (*order.shape, self.assignments.shape[-1]))
+        return replace(
+            self,
+            assignments=xp.take_along_axis(self.assignments, places, axis=-2),
+            energies=xp.take_along_axis(self.energies, order, axis=-1),
+            status=xp.take_along_axis(self.status, order, axis=-1),
+            steps=xp.take_along_axis(self.steps, order, axis=-1),
+            population=None if self.population is None else xp.take_along_axis(self.population, order, axis=-1),
+        )
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""

@@ -13,6 +13,8 @@ from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.annealing import GibbsAnnealing
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.compiled import without_zeros
+from memcomp_lightning.solvers.crossover import CrossoverAnnealing
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 if TYPE_CHECKING:
@@ -21,45 +23,52 @@ if TYPE_CHECKING:
 MOST_ENUMERATED = 12
 """Variables up to which enumeration is as quick as any search, and a proof."""
 
-STEPS_A_SWEEP = 8
-"""Steps of a tabu search that take about as long as a sweep of annealing."""
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Portfolio:
-    """Solve QUBOs by what suits them: enumeration where it is quick, else annealing or tabu search.
+    """Solve QUBOs by what suits them.
 
-    An eighth of the restarts anneal and an eighth search, each for about the same time. Where the best of them
-    differ, the better method does the rest; where they agree, both do. What was found decides, not a clock: the
-    same seed gives the same answer on every machine.
+    Few variables are enumerated, listed pairs annealed with crossover. In two full layers an eighth of the
+    restarts anneal and an eighth search by tabu, each for about the same time; where the best of them differ, the
+    better method does the rest, where they agree, both do. What was found decides, not a clock: the same seed
+    gives the same answer on every machine.
 
     Attributes:
-        n_restarts: Starts for each problem, >= 8.
-        effort: Factor > 0 on the sweeps of each restart; 1 is :func:`default_sweeps` of the problem.
+        n_restarts: Starts for each problem, >= 1.
+        effort: Factor > 0 on the sweeps and steps of each restart.
     """
 
     n_restarts: int = 28
     effort: float = 1.0
 
     def __post_init__(self) -> None:
-        require_count("n_restarts", self.n_restarts, 8)
+        require_count("n_restarts", self.n_restarts)
         require(0 < self.effort < math.inf, "effort", self.effort, "a number > 0")
 
     def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
         """Return the best state of each restart, of the trials first; a single one where it is proven."""
-        begin = time.perf_counter() - compiling.seconds_spent()
         graph = qubo.graph
         enumerated = min(graph.n_first, graph.n_second) if isinstance(graph, Bipartite) else graph.n
         if enumerated <= MOST_ENUMERATED:
             return BruteForce(max_variables=MOST_ENUMERATED).minimise(qubo, generator=generator)
-        n_sweeps = max(10, round(self.effort * default_sweeps(qubo)))
-        anneal = GibbsAnnealing(n_restarts=self.n_restarts // 8, n_sweeps=n_sweeps)
-        search = TabuSearch(n_restarts=self.n_restarts // 8, n_steps=STEPS_A_SWEEP * n_sweeps)
-        trials: list[QuboSolver] = [anneal, search]
+        qubo = without_zeros(qubo)
+        if not isinstance(qubo.graph, Bipartite):
+            crossover = CrossoverAnnealing(n_restarts=self.n_restarts)
+            crossover = replace(crossover, n_sweeps=self._of(crossover.n_sweeps))
+            return crossover.minimise(qubo, generator=generator)
+        return self._of_layers(qubo, generator)
+
+    def _of_layers(self, qubo: Qubo, generator: "Generator") -> QuboSolution:
+        """Trials of annealing and tabu search, then the better one."""
+        begin = time.perf_counter() - compiling.seconds_spent()
+        n_trial, n_sweeps = max(1, self.n_restarts // 8), self._of(default_sweeps(qubo))
+        anneal = GibbsAnnealing(n_restarts=n_trial, n_sweeps=n_sweeps)
+        search = TabuSearch(n_restarts=n_trial, n_steps=max(1, round(n_sweeps * qubo.n * STEPS_A_SWEEP)))
+        trials: list[QuboSolver] = [anneal, search] if self.n_restarts > 1 else [anneal]
         found = [solver.minimise(qubo, generator=generator) for solver in trials]
-        annealed, searched = (float(solution.best_energy.sum()) for solution in found)
-        n_left = self.n_restarts - 2 * (self.n_restarts // 8)
-        n_annealed = n_left // 2 if annealed == searched else n_left if annealed < searched else 0
+        energies = [float(solution.best_energy.sum()) for solution in found]
+        n_left = self.n_restarts - n_trial * len(trials)
+        n_annealed = n_left // 2 if energies[0] == energies[-1] else n_left if energies[0] < energies[-1] else 0
         rest: list[QuboSolver] = []
         if n_annealed:
             rest.append(replace(anneal, n_restarts=n_annealed))
@@ -75,7 +84,15 @@ class Portfolio:
             wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
         )
 
+    def _of(self, n: int) -> int:
+        """So many sweeps, times the effort."""
+        return max(1, round(self.effort * n))
+
+
+STEPS_A_SWEEP = 0.02
+"""Steps of a tabu search that take about as long as a sweep of annealing, a variable."""
+
 
 def default_sweeps(qubo: Qubo) -> int:
-    """Sweeps of a restart: as many as there are variables, from 30 to 1,000."""
+    """Sweeps of a restart in two layers: as many as there are variables, from 30 to 1,000."""
     return min(1000, max(30, qubo.n))

@@ -3,9 +3,12 @@
 import importlib.util
 import math
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -15,12 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning import rng
-from memcomp_lightning.arrays import AnyArray, Array, alike, to_numpy
+from memcomp_lightning import compiling, rng
+from memcomp_lightning.arrays import AnyArray, Array, alike, namespace, to_numpy
 from memcomp_lightning.compiling import n_threads
 from memcomp_lightning.errors import require, require_choice
 from memcomp_lightning.problems.graph import Bipartite, EdgeList
 from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.solvers.base import QuboSolution, Status
 
 if TYPE_CHECKING:
     from memcomp_lightning.rng import Generator
@@ -32,37 +36,35 @@ Numbers = NDArray[Any]
 
 
 class Layers(NamedTuple):
-    """Two fully coupled layers, problems on one axis, in float64.
+    """Two fully coupled layers, problems on one axis.
 
     Attributes:
-        of_first: Couplings of each unit of the first layer, ``(n_problems, n_first, n_second)``.
-        of_second: Its transpose.
+        couplings: Of each unit of the second layer, ``(n_problems, n_second, n_first)``.
         own: The linear part, ``(n_problems, n)``.
     """
 
-    of_first: Numbers
-    of_second: Numbers
+    couplings: Numbers
     own: Numbers
-
-    @property
-    def couplings(self) -> Numbers:
-        """Each coupling once."""
-        return self.of_first
 
     @property
     def size(self) -> int:
         """Couplings of a problem."""
-        return self.of_first[0].size
+        return self.couplings[0].size
 
     @property
     def strength(self) -> Numbers:
         """Sum of the sizes of the couplings of each variable, ``(n_problems, n)``."""
-        size = np.abs(self.of_first)
-        return np.concatenate((size.sum(2), size.sum(1)), axis=1)
+        size = np.abs(self.couplings)
+        return np.concatenate((size.sum(1, dtype=np.float64), size.sum(2, dtype=np.float64)), axis=1)
+
+    def rows(self, converted: Callable[[Numbers], Numbers]) -> tuple[Numbers, ...]:
+        """The couplings of each unit of the first layer, ``(n_problems, n_first, n_second)``; of the second."""
+        of_second = converted(self.couplings)
+        return np.ascontiguousarray(of_second.transpose(0, 2, 1)), of_second
 
 
 class Neighbours(NamedTuple):
-    """Listed pairs, seen from each variable, problems on one axis, in float64.
+    """Listed pairs, seen from each variable, problems on one axis.
 
     Attributes:
         begins: Where the neighbours of each variable begin, ``(n + 1,)``.
@@ -84,18 +86,21 @@ class Neighbours(NamedTuple):
     @property
     def strength(self) -> Numbers:
         """Sum of the sizes of the couplings of each variable, ``(n_problems, n)``."""
-        total = np.cumsum(np.abs(self.couplings), axis=1)
+        total = np.cumsum(np.abs(self.couplings), axis=1, dtype=np.float64)
         total = np.concatenate((np.zeros((len(total), 1)), total), axis=1)
         return np.diff(total[:, self.begins], axis=1)
+
+    def rows(self, converted: Callable[[Numbers], Numbers]) -> tuple[Numbers, ...]:
+        """Where the neighbours of each variable begin, the neighbours and the couplings with them."""
+        return self.begins, self.variables, converted(self.couplings)
 
 
 def seen_from_variables(qubo: Qubo) -> Layers | Neighbours:
     """The couplings of each variable, as the kernels read them."""
-    coupling, own = (to_numpy(part).astype(np.float64) for part in (qubo.coupling, qubo.linear))
+    coupling, own = to_numpy(qubo.coupling), to_numpy(qubo.linear).astype(np.float64)
     own = own.reshape(math.prod(qubo.problems), qubo.n)
     if isinstance(qubo.graph, Bipartite):
-        of_second = np.ascontiguousarray(coupling.reshape(-1, *qubo.graph.edge_shape))
-        return Layers(np.ascontiguousarray(of_second.transpose(0, 2, 1)), of_second, own)
+        return Layers(np.ascontiguousarray(coupling.reshape(-1, *qubo.graph.edge_shape)), own)
     pairs = to_numpy(qubo.graph.edges())
     order, begins = grouped(pairs.T.ravel(), qubo.n)
     others = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
@@ -117,10 +122,14 @@ def without_zeros(qubo: Qubo) -> Qubo:
     """Turn two layers with few couplings other than zero into a list of pairs, which is faster."""
     if not isinstance(qubo.graph, Bipartite):
         return qubo
+    sparse = listed(qubo)
+    return qubo if len(sparse.graph.edges()) > SPARSE * math.prod(qubo.graph.edge_shape) else sparse
+
+
+def listed(qubo: Qubo) -> Qubo:
+    """The problem with those couplings that are not zero as a list of pairs."""
     flat = qubo.coupling.reshape(*qubo.problems, -1)
-    used = (flat != 0).reshape(-1, flat.shape[-1]).any(0)
-    if used.sum() > SPARSE * len(used):
-        return qubo
+    used = (flat != 0).reshape(math.prod(qubo.problems), -1).any(0)
     pairs = alike(qubo.graph.edges(), used)[used]
     return Qubo(EdgeList(n=qubo.n, pairs=pairs), flat[..., used], qubo.linear, qubo.offset)
 
@@ -131,8 +140,9 @@ def power_of_two(*parts: AnyArray) -> Numbers:
     Args:
         parts: ``(n_problems, ...)`` each.
     """
-    sizes = [np.abs(to_numpy(part)).reshape(len(part), -1) for part in parts]
-    return np.exp2(np.frexp(np.max([size.max(1, initial=1e-300) for size in sizes], axis=0))[1])
+    flat = [to_numpy(part).reshape(len(part), -1) for part in parts]
+    ends = [end.astype(np.float64) for part in flat for end in (part.max(1, initial=0), -part.min(1, initial=0))]
+    return np.exp2(np.frexp(np.max(ends, axis=0).clip(min=1e-300))[1])
 
 
 def over(part: AnyArray, unit: Numbers) -> Numbers:
@@ -144,6 +154,38 @@ def over(part: AnyArray, unit: Numbers) -> Numbers:
 def float32(x: AnyArray) -> Numbers:
     """A contiguous float32 array."""
     return np.ascontiguousarray(to_numpy(x), np.float32)
+
+
+def solution_of(
+    qubo: Qubo,
+    x: Array,
+    begin: float,
+    *,
+    steps: int,
+    status: Array | None = None,
+    was_run: Array | None = None,
+    in_time: bool = True,
+) -> QuboSolution:
+    """What a search returns.
+
+    Args:
+        qubo: The problems.
+        x: The state of each restart, ``(*problems, n_restarts, n)``.
+        begin: Time of ``time.perf_counter()`` when it began, less what compilation took until then.
+        steps: Steps or sweeps of each restart.
+        status: How each restart ended, ``(*problems, n_restarts)``; None is STEP_BUDGET.
+        was_run: Which were run, ``(*problems, n_restarts)`` bool; None is all.
+        in_time: Whether all came to their end.
+    """
+    xp = namespace(x)
+    each = xp.ones(x.shape[:-1], dtype=xp.int64, device=x.device)
+    status = each * int(Status.STEP_BUDGET) if status is None else status
+    status = status if in_time else each * int(Status.STOPPED)
+    energies = qubo.energy(x)
+    if was_run is not None:
+        status, energies = xp.where(was_run, status, int(Status.NOT_RUN)), xp.where(was_run, energies, xp.inf)
+    wall_time_s = time.perf_counter() - compiling.seconds_spent() - begin
+    return QuboSolution(x, energies, status, each * steps, wall_time_s)
 
 
 # ----------------------------------------------------------------------------------------------------- the threads
@@ -186,9 +228,15 @@ def _import_failure() -> str | None:
 
 
 def share(
-    kernel: Any, n_items: int, work: float, arguments: tuple[Any, ...], inlined: Sequence[ModuleType] = ()
-) -> None:
-    """Run items 0 to ``n_items - 1`` on as many threads as there are.
+    kernel: Any,
+    n_items: int,
+    work: float,
+    arguments: tuple[Any, ...],
+    inlined: Sequence[ModuleType] = (),
+    *,
+    anytime: bool = False,
+) -> bool:
+    """Run items 0 to ``n_items - 1`` on as many threads as there are; return whether all came to their end.
 
     Compiled code is deaf to Ctrl-C: what takes long runs on threads of its own, which this one tells to stop.
 
@@ -199,24 +247,62 @@ def share(
         work: Operations in all, about.
         arguments: The kernel's.
         inlined: Modules whose functions become part of the kernel.
+        anytime: Whether a kernel that is stopped has written what it found: it obeys :func:`limited`.
     """
     forget_outdated(kernel, tuple(inlined))
-    stop = np.zeros(1, np.uint8)
+    stop, limit = np.zeros(1, np.uint8), _LIMIT.get() if anytime else None
     most = min(n_threads(), n_items)
-    if most <= 1 and work < _SHORT:
+    if most <= 1 and work < _SHORT and limit is None:
         kernel(0, n_items, stop, *arguments)
-        return
+        return True
     if not kernel.signatures:
         kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
     cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
     jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
+    left = math.inf if limit is None else limit.until - time.perf_counter()
     try:
+        _, late = wait(jobs, None if left == math.inf else max(left, 0.0))
+        stop[0] = 1
         for job in jobs:
             job.result()
-    except BaseException:
+        return not late
+    except BaseException as error:
         stop[0] = 1
         wait(jobs)
-        raise
+        if limit is None or not isinstance(error, KeyboardInterrupt):
+            raise
+        limit.until, limit.interrupted = 0.0, True
+        return False
+
+
+@dataclass(slots=True)
+class Limit:
+    """When searches end, and whether Ctrl-C came first.
+
+    Attributes:
+        until: Time of ``time.perf_counter()``.
+        interrupted: Whether Ctrl-C ended a search.
+    """
+
+    until: float
+    interrupted: bool = False
+
+
+_LIMIT: ContextVar[Limit | None] = ContextVar("limit", default=None)
+
+
+@contextmanager
+def limited(until: float) -> Iterator[Limit]:
+    """Within this context annealing, crossover and tabu search end in time, or at Ctrl-C, with what they found.
+
+    Args:
+        until: Time of ``time.perf_counter()``, or infinity.
+    """
+    token = _LIMIT.set(limit := Limit(until))
+    try:
+        yield limit
+    finally:
+        _LIMIT.reset(token)
 
 
 _SHORT = 2e8

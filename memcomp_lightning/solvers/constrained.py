@@ -81,6 +81,9 @@ class PenaltyLoop:
             wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
             trajectory=found[-1].trajectory,
             broken=concat([solution.broken for solution in found], axis=-1),
+            population=None
+            if found[0].population is None
+            else concat([solution.population for solution in found], axis=-1),
         )
 
 

@@ -1,7 +1,6 @@
 """What a search has found, and what its restarts say together."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ PROVEN = (Status.OPTIMAL, Status.INFEASIBLE, Status.ROUNDED)
 """How a search of all states ends: another one would end likewise."""
 
 LEAST_AGREEING, SHARE_AGREEING = 3, 1 / 3
-"""Restarts that must have reached the best energy, and their share of all, for ``AGREED``."""
+"""Restarts that must have reached the best energy, and the share of the populations, for ``AGREED``."""
 
 
 class State(NamedTuple):
@@ -43,6 +42,7 @@ class Found:
         broken: Number of constraints that each restart's state breaks.
         status: How each restart ended.
         steps: Integration steps, sweeps or flips of each restart.
+        population: Number of the population of each restart; those of different ones are independent.
         lower_bound: No state has a lower energy; minus infinity where none is known.
         resolution: Energies that differ by no more are the same.
         wall_time_s: Seconds in all.
@@ -57,6 +57,7 @@ class Found:
     broken: list[int]
     status: list[Status]
     steps: list[int]
+    population: list[int]
     lower_bound: float = -math.inf
     resolution: float = 0.0
     wall_time_s: float = 0.0
@@ -72,31 +73,38 @@ class Found:
     @property
     def n_reached(self) -> int:
         """Number of restarts that end at the best energy."""
-        return len(self._ends())
+        return len(self._best())
+
+    @property
+    def agree(self) -> bool:
+        """Whether three restarts end at the best energy, in two populations and in a third of all, at least.
+
+        Descents that CONVERGED do not count: many of them may end in the same wrong minimum.
+        """
+        reached = [k for k in self._best() if self.status[k] is not Status.CONVERGED]
+        populations = {self.population[k] for k, energy in enumerate(self.energies) if energy is not None}
+        n_agreeing = len({self.population[k] for k in reached})
+        return len(reached) >= LEAST_AGREEING and n_agreeing >= max(2, SHARE_AGREEING * len(populations))
 
     @property
     def conclusion(self) -> Status:
-        """What is known of the best energy: a proof, that restarts agree, or how one ended that reached it.
-
-        Descents that CONVERGED do not count as agreeing: many of them may end in the same wrong minimum.
-        """
-        ends = self._ends()
+        """What is known of the best energy: a proof, that restarts agree, or how one ended that reached it."""
+        ends = [self.status[k] for k in self._best()]
         proven = next((status for status in PROVEN if status in ends), None)
         if proven is not None:
             return proven
         if not self.states[0].n_broken:
             if self.states[0].energy - self.lower_bound <= self.resolution:
                 return Status.OPTIMAL
-            n_agreeing = len(ends) - ends.count(Status.CONVERGED)
-            if n_agreeing >= max(LEAST_AGREEING, SHARE_AGREEING * self.n_run):
+            if self.agree:
                 return Status.AGREED
         return ends[0] if ends else Status.STEP_BUDGET
 
-    def _ends(self) -> Sequence[Status]:
-        """How the restarts ended that reached the best energy."""
-        best, each = self.states[0], zip(self.energies, self.broken, self.status, strict=True)
+    def _best(self) -> list[int]:
+        """The restarts that end at the best energy."""
+        best, each = self.states[0], zip(self.energies, self.broken, strict=True)
         return [
-            status
-            for energy, n_broken, status in each
+            k
+            for k, (energy, n_broken) in enumerate(each)
             if energy is not None and n_broken == best.n_broken and energy - best.energy <= self.resolution
         ]

@@ -2,7 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, is_dataclass, replace
 from fractions import Fraction
 from numbers import Real
@@ -22,10 +23,11 @@ from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.answer import in_full_of
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedStates, Status
 from memcomp_lightning.solvers.best import MOST_ENUMERATED, Portfolio
+from memcomp_lightning.solvers.compiled import limited
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.solvers.found import PROVEN, Found, State
 from memcomp_lightning.solvers.proofs import RoofDual, eliminated, parts_of, roof_dual, rounding
-from memcomp_lightning.solvers.solving import Given, minimise, numbers_of
+from memcomp_lightning.solvers.solving import Given, constrained_of, minimise, numbers_of
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 Bits = NDArray[np.bool_]
@@ -81,11 +83,13 @@ class Search:
         """
         given = numbers_of(problem)
         require(given.problems == (), "problems", given.problems, "one problem, without leading axes")
-        record = _Record(self, problem, callback)
+        record, generator = _Record(self, problem, callback), rng.numpy_stream(seed, "solver")
         try:
             if initial is not None:
                 record.offer(initial)
-            self._rounds(record, problem, solver, rng.numpy_stream(seed, "solver"))
+            if initial is not None and not record.settled:
+                record.improve(initial, rng.numpy_stream(seed, "initial states"))
+            self._rounds(record, problem, solver, generator)
         except KeyboardInterrupt:
             if not record.states:
                 raise
@@ -96,17 +100,16 @@ class Search:
         self, record: "_Record", problem: Given, solver: QuboSolver, generator: np.random.Generator
     ) -> None:
         """Solve, and tell the record."""
-        limit = self.time_limit or (0.0 if self.target is None else math.inf)
         if isinstance(solver, Portfolio):
             record.prove()
+        one_call = self.time_limit is None and self.target is None
         while not record.settled or self.n_solutions > 1:
             begin = record.seconds
-            solution = minimise(problem, solver, generator)
-            record.add(solution)
+            solution = record.solve(solver, generator)
             if not record.settled:
                 record.bound()
-            left, took = limit - record.seconds, record.seconds - begin
-            if record.settled or left < _WORTH * took:
+            left, took = record.left, record.seconds - begin
+            if one_call or record.settled or left < _WORTH * took:
                 break
             solver = _longer(solver, min(2.0, left / took), int(solution.steps.max()))
         if len(record.states) < self.n_solutions:
@@ -152,7 +155,7 @@ class _Record:
         self._resolution = 0.75 * self._unit if self._unit else self._noise
         self._curve, self._lower_bound = list[tuple[float, Exact | float]](), -math.inf
         self._energies, self._status, self._steps = list[Exact | float | None](), list[Status](), list[int]()
-        self._broken = list[int]()
+        self._broken, self._population = list[int](), list[int]()
         self._trajectory: RecordedStates | None = None
         self._last: QuboSolution | None = None
         self.states: list[State] = []
@@ -161,6 +164,20 @@ class _Record:
     def seconds(self) -> float:
         """Since the search began."""
         return time.perf_counter() - compiling.seconds_spent() - self._begin
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left for rounds: if several states are asked for, a tenth is kept for :meth:`fill`."""
+        limit = self._search.time_limit or math.inf
+        return limit * (1.0 if self._search.n_solutions == 1 else 0.9) - self.seconds
+
+    @contextmanager
+    def _within(self, seconds: float) -> Iterator[None]:
+        """Searches in here end in time; Ctrl-C comes up after what they return is taken in."""
+        with limited(time.perf_counter() + seconds) as limit:
+            yield
+        if limit.interrupted:
+            raise KeyboardInterrupt
 
     @property
     def settled(self) -> bool:
@@ -176,6 +193,7 @@ class _Record:
             broken=self._broken,
             status=self._status,
             steps=self._steps,
+            population=self._population,
             lower_bound=self._lower_bound,
             resolution=self._resolution,
             wall_time_s=self.seconds,
@@ -184,6 +202,15 @@ class _Record:
         )
         proven = found.conclusion is Status.OPTIMAL
         return replace(found, lower_bound=float(found.states[0].energy)) if proven else found
+
+    def solve(self, solver: QuboSolver, generator: np.random.Generator) -> QuboSolution:
+        """A round."""
+        with self._within(self.left):
+            solution = minimise(self._problem, solver, generator)
+            self.add(solution)
+            if not self.states:  # the time was up before any restart began
+                self.offer(np.zeros((1, self._given.n), np.bool_))
+        return solution
 
     def add(self, solution: QuboSolution) -> None:
         """Take in what a round has found."""
@@ -198,6 +225,9 @@ class _Record:
         self._broken += broken
         self._status += status
         self._steps += solution.steps.tolist()
+        number = range(len(status)) if solution.population is None else solution.population.tolist()
+        first = 1 + max(self._population, default=-1)
+        self._population += [first + k for k in number]
         self._trajectory, self._last = self._trajectory or solution.trajectory, solution
         x = to_numpy(solution.assignments) > 0.5
         each = enumerate(zip(energies, broken, strict=True))
@@ -235,6 +265,15 @@ class _Record:
                 if self._callback is not None:
                     self._callback(state)
 
+    def improve(self, x: Bits, generator: np.random.Generator) -> None:
+        """Offer what short tabu searches find from these states, if the problem is as plain as they are."""
+        if self._qubo.n == self._given.n > 0 and constrained_of(self._problem) is None:
+            start = cast(alike(x, self._qubo.linear), self._qubo.linear.dtype)
+            solver = TabuSearch(n_restarts=len(x), n_steps=max(10, self._qubo.n))
+            with self._within(self.left):
+                found = solver.minimise(self._qubo, start=start, generator=generator)
+                self.offer(to_numpy(found.assignments) > 0.5)
+
     def prove(self) -> None:
         """Look for a proof that takes little time, and else for a lower bound."""
         if self._qubo.n == 0 or isinstance(self._problem, Constrained):
@@ -259,9 +298,11 @@ class _Record:
         if 0 < self._given.n <= MOST_ENUMERATED:
             self.offer(to_numpy(binary_states(self._given.n, like=as_array(np.zeros(0)))) > 0.5)
         else:
-            n_steps = [math.ceil(share * self._given.n) for share in _SHORT]
-            for solver in (TabuSearch(n_restarts=2 * self._search.n_solutions, n_steps=n) for n in n_steps):
-                self.offer(to_numpy(minimise(self._problem, solver, generator).assignments) > 0.5)
+            for share in _SHORT:
+                n_restarts, n_steps = 2 * self._search.n_solutions, math.ceil(share * self._given.n)
+                with self._within((self._search.time_limit or math.inf) - self.seconds):
+                    short = TabuSearch(n_restarts=n_restarts, n_steps=n_steps)
+                    self.offer(to_numpy(minimise(self._problem, short, generator).assignments) > 0.5)
 
     def _meets_target(self) -> bool:
         target, energy = self._search.target, self.states[0].energy

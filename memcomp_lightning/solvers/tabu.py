@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from memcomp_lightning import compiling, rng
-from memcomp_lightning.arrays import Array, alike, cast, namespace
+from memcomp_lightning.arrays import Array, alike, cast, namespace, to_numpy
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import random_states
@@ -23,6 +23,7 @@ from memcomp_lightning.solvers.compiled import (
     seeds,
     seen_from_variables,
     share,
+    solution_of,
     without_zeros,
 )
 
@@ -66,37 +67,42 @@ class TabuSearch:
         require(0 < self.kick <= 1, "kick", self.kick, "a number in (0, 1]")
         check_kernel(self.kernel)
 
-    def minimise(self, qubo: Qubo, *, generator: "Generator") -> QuboSolution:
-        """Return the best state of each restart."""
-        qubo = qubo.floating()
-        begin = time.perf_counter() - compiling.seconds_spent()
-        n_steps = self.n_steps or max(500, 20 * qubo.n)
+    def minimise(self, qubo: Qubo, *, generator: "Generator", start: Array | None = None) -> QuboSolution:
+        """Return the best state of each restart.
+
+        Args:
+            qubo: One or many problems of one graph.
+            generator: Of numpy or torch.
+            start: Where each restart begins, ``(*problems, n_restarts, n)`` in {0, 1}; None draws states.
+        """
+        qubo, begin = qubo.floating(), time.perf_counter() - compiling.seconds_spent()
+        n_steps, shape = self.n_steps or max(500, 20 * qubo.n), (*qubo.problems, self.n_restarts, qubo.n)
+        if start is None:
+            start = random_states(qubo, self.n_restarts, generator)
+        require(tuple(start.shape) == shape, "start shape", tuple(start.shape), f"{shape}")
         compiled = self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0
-        x, found_at = (self._compiled if compiled else self._reference)(qubo, n_steps, generator)
-        xp = namespace(x)
-        return QuboSolution(
-            assignments=x,
-            energies=qubo.energy(x),
-            status=xp.where(found_at > 0.9 * n_steps, int(Status.STILL_IMPROVING), int(Status.STEP_BUDGET)),
-            steps=xp.full_like(found_at, n_steps),
-            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
-        )
+        x, found_at, in_time = (self._compiled if compiled else self._reference)(qubo, n_steps, generator, start)
+        late = found_at > 0.9 * n_steps
+        status = namespace(x).where(late, int(Status.STILL_IMPROVING), int(Status.STEP_BUDGET))
+        return solution_of(qubo, x, begin, steps=n_steps, status=status, was_run=found_at >= 0, in_time=in_time)
 
     def _settings(self, n: int) -> tuple[int, int, int, int]:
         """Tenure, range of what is added to it, patience and number of variables of a kick."""
         tenure = min(10, n // 4) if self.tenure is None else self.tenure
         return tenure, max(1, tenure), self.patience or 5 * n, max(1, round(self.kick * n))
 
-    def _compiled(self, qubo: Qubo, n_steps: int, generator: "Generator") -> tuple[Array, Array]:
-        """Whole numbers, see ``kernels.tabu``."""
+    def _compiled(
+        self, qubo: Qubo, n_steps: int, generator: "Generator", start: Array
+    ) -> tuple[Array, Array, bool]:
+        """The states, the step of each and whether all came to their end: see ``kernels.tabu``."""
         from memcomp_lightning.solvers.kernels import random, tabu
 
         problem = seen_from_variables(without_zeros(qubo))
         n_items = len(problem.own) * self.n_restarts
         own_seeds = seeds(n_items, generator)
         unit = _unit(problem)
-        couplings = tuple(_whole(part, unit) for part in problem[:-1])
-        best, found_at = np.zeros((n_items, qubo.n), np.bool_), np.zeros(n_items, np.int64)
+        couplings = problem.rows(lambda part: _whole(part, unit))
+        best, found_at = (to_numpy(start) > 0.5).reshape(n_items, qubo.n), np.full(n_items, -1)
         arguments = (
             couplings,
             _whole(problem.own, unit),
@@ -106,14 +112,17 @@ class TabuSearch:
             best,
             found_at,
         )
-        share(tabu.search, n_items, n_items * n_steps * qubo.n / 10, arguments, (random,))
+        work = n_items * n_steps * qubo.n / 10
+        in_time = share(tabu.search, n_items, work, arguments, (random,), anytime=True)
         each = (*qubo.problems, self.n_restarts)
         x = cast(alike(best.reshape(*each, qubo.n), qubo.linear), qubo.linear.dtype)
-        return x, alike(found_at.reshape(each), qubo.linear)
+        return x, alike(found_at.reshape(each), qubo.linear), in_time
 
-    def _reference(self, qubo: Qubo, n_steps: int, generator: "Generator") -> tuple[Array, Array]:
+    def _reference(
+        self, qubo: Qubo, n_steps: int, generator: "Generator", start: Array
+    ) -> tuple[Array, Array, bool]:
         """Plain operations on arrays; all restarts go back to their best states after as many steps."""
-        xp, x = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator)
+        xp, x = namespace(qubo.linear), cast(start, qubo.linear.dtype)
         tenure, spread, patience, n_kicked = self._settings(qubo.n)
         best, energy = xp.asarray(x, copy=True), qubo.energy(x)
         lowest, found_at = energy, xp.zeros_like(energy, dtype=xp.int64)
@@ -139,7 +148,7 @@ class TabuSearch:
                 x = xp.where(back[..., None], xp.where(kicked, 1 - best, best), x)
                 energy, free_from = qubo.energy(x), xp.where(back[..., None], 0, free_from)
                 lately, lately_at = xp.where(back, energy, lately), xp.where(back, step, lately_at)
-        return best, found_at
+        return best, found_at, True
 
 
 def _unit(problem: Layers | Neighbours) -> Numbers:
@@ -148,7 +157,5 @@ def _unit(problem: Layers | Neighbours) -> Numbers:
 
 
 def _whole(part: Numbers, unit: Numbers) -> Numbers:
-    """Rounded to whole numbers of a unit; indices stay what they are."""
-    if part.dtype != np.float64:
-        return part
+    """Rounded to whole numbers of a unit."""
     return np.ascontiguousarray(np.rint(part / unit.reshape(-1, *(1,) * (part.ndim - 1))), np.int32)

@@ -30,22 +30,24 @@ def anneal_layers(first_item, last_item, stop, problem, betas, quench, threshold
     Args:
         first_item: Of ``n_problems * n_restarts``, problem after problem.
         last_item: One past the last.
-        stop: Of one number; other than 0 ends the work.
+        stop: Of one number; other than 0 ends the work: the state of the moment descends, and is the last.
         problem: ``of_first (n_problems, n_first, n_second)`` the couplings of each unit of the first layer,
             ``of_second`` its transpose, ``own (n_problems, n)`` the linear part.
         betas: Inverse temperatures, ``(n_problems, n_sweeps)``.
         quench: The first sweep after which a copy descends, and the sweeps from one to the next.
         thresholds: See ``random.thresholds``.
         seeds: ``(n_items,)``.
-        best: Out, the best of the copies, ``(n_items, n)`` in {0, 1}.
+        best: Out, the best of the copies, ``(n_items, n)`` in {0, 1}; stays what it is where no time was left.
     """
     of_first, of_second, own = problem
     n_problems, n_first, n_second = of_first.shape
     n_restarts = seeds.size // n_problems
-    x, kept = np.empty((2, n_first + n_second), np.float32)
-    field, kept_field = np.empty((2, n_first + n_second), np.float32)
+    x, kept = np.empty(n_first + n_second, np.float32), np.empty(n_first + n_second, np.float32)
+    field, kept_field = np.empty_like(x), np.empty_like(x)
     flipped, state = np.empty(max(n_first, n_second) + 1, np.int64), np.empty(1, np.uint64)
     for item in range(first_item, last_item):
+        if stop[0] and item > first_item:
+            return
         p = item // n_restarts
         random.begin(state, seeds[item])
         by_first, by_second = of_first[p], of_second[p]
@@ -60,8 +62,6 @@ def anneal_layers(first_item, last_item, stop, problem, betas, quench, threshold
                 field[:n_first] += by_second[i]
         lowest, n_sweeps = F32(np.inf), betas.shape[1]
         for sweep in range(n_sweeps):
-            if stop[0]:
-                return
             beta = betas[p, sweep]
             at = random.below(state, random.N_THRESHOLDS)
             n = _draw(x[:n_first], field[:n_first], thresholds[at:], beta, flipped)
@@ -69,7 +69,8 @@ def anneal_layers(first_item, last_item, stop, problem, betas, quench, threshold
             at = random.below(state, random.N_THRESHOLDS)
             n = _draw(x[n_first:], field[n_first:], thresholds[at:], beta, flipped)
             _add_rows(field[:n_first], by_second, flipped, n, x[n_first:])
-            if sweep + 1 == n_sweeps or (sweep >= quench[0] and (sweep - quench[0]) % quench[1] == 0):
+            is_last = sweep + 1 == n_sweeps or stop[0] != 0
+            if is_last or (sweep >= quench[0] and (sweep - quench[0]) % quench[1] == 0):
                 kept[:] = x
                 kept_field[:] = field
                 energy = _quench_layers(kept, kept_field, by_first, by_second, own[p], flipped)
@@ -77,6 +78,8 @@ def anneal_layers(first_item, last_item, stop, problem, betas, quench, threshold
                     lowest = energy
                     for i in range(x.size):
                         best[item, i] = kept[i] > F32(0)
+            if is_last:
+                break
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST_MATH)
@@ -157,22 +160,26 @@ def anneal_pairs(first_item, last_item, stop, problem, betas, quench, thresholds
     Args:
         first_item: Of ``n_problems * n_blocks``, problem after problem.
         last_item: One past the last.
-        stop: Of one number; other than 0 ends the work.
+        stop: Of one number; other than 0 ends the work: the state of the moment descends, and is the last.
         problem: ``begins (n + 1,)`` where the neighbours of each variable begin, ``neighbours (n_entries,)``,
             ``couplings (n_problems, n_entries)`` and ``own (n_problems, n)``, the linear part.
         betas: Inverse temperatures, ``(n_problems, n_sweeps)``.
         quench: The first sweep after which a copy descends, and the sweeps from one to the next.
         thresholds: See ``random.thresholds``.
         seeds: ``(n_items,)``.
-        best: Out, the best of the copies, ``(n_items, n, LANES)`` in {0, 1}.
+        best: Out, the best of the copies, ``(n_items, n, LANES)`` in {0, 1}; stays what it is where no time
+            was left.
     """
     begins, neighbours, couplings, own = problem
     n_problems, n = own.shape
     n_blocks = seeds.size // n_problems
-    x, kept, field, kept_field = np.empty((4, n, LANES), np.float32)
-    change, energy, lowest = np.empty((3, LANES), np.float32)
+    x, kept = np.empty((n, LANES), np.float32), np.empty((n, LANES), np.float32)
+    field, kept_field = np.empty_like(x), np.empty_like(x)
+    change, energy, lowest = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     state = np.empty(1, np.uint64)
     for item in range(first_item, last_item):
+        if stop[0] and item > first_item:
+            return
         p = item // n_blocks
         random.begin(state, seeds[item])
         pairs = (begins, neighbours, couplings[p])
@@ -181,68 +188,69 @@ def anneal_pairs(first_item, last_item, stop, problem, betas, quench, thresholds
         for i in range(n):
             for lane in range(LANES):
                 change[lane] = x[i, lane] = F32(random.draw(state) >> np.uint64(63))
-            _spread(field, pairs, i, change)
+            spread(field, pairs, i, change)
         lowest[:] = np.inf
         n_sweeps = betas.shape[1]
         for sweep in range(n_sweeps):
-            if stop[0]:
-                return
             at = random.below(state, random.N_THRESHOLDS)
-            _sweep_lanes(x, field, pairs, thresholds, at, betas[p, sweep], change)
-            if sweep + 1 == n_sweeps or (sweep >= quench[0] and (sweep - quench[0]) % quench[1] == 0):
+            sweep_lanes(x, field, pairs, thresholds, at, betas[p, sweep], change)
+            is_last = sweep + 1 == n_sweeps or stop[0] != 0
+            if is_last or (sweep >= quench[0] and (sweep - quench[0]) % quench[1] == 0):
                 kept[:] = x
                 kept_field[:] = field
-                _quench_lanes(kept, kept_field, pairs, own[p], change, energy)
+                quench_lanes(kept, kept_field, pairs, own[p], change, energy)
                 for lane in range(LANES):
                     if energy[lane] < lowest[lane]:
                         lowest[lane] = energy[lane]
                         for i in range(n):
                             best[item, i, lane] = kept[i, lane] > F32(0)
+            if is_last:
+                break
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST_MATH)
-def _sweep_lanes(x, field, pairs, thresholds, at, beta, change):
+def sweep_lanes(x, field, pairs, thresholds, at, beta, change):
     """Draw each variable in turn given all others, in all lanes."""
     for i in range(x.shape[0]):
         pool = thresholds[(at + i * LANES) % random.N_THRESHOLDS :]
         own, here, n_flipped = x[i], field[i], F32(0)
-        for lane in range(LANES):
+        for lane in range(change.size):
             new = F32(pool[lane] < -beta * here[lane])
             change[lane] = new - own[lane]
             own[lane] = new
             n_flipped += change[lane] * change[lane]
         if n_flipped > F32(0):
-            _spread(field, pairs, i, change)
+            spread(field, pairs, i, change)
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST_MATH)
-def _spread(field, pairs, i, change):
+def spread(field, pairs, i, change):
     """Bring the fields of the neighbours of variable i up to date."""
     begins, neighbours, couplings = pairs
     for k in range(begins[i], begins[i + 1]):
         there, coupling = field[neighbours[k]], couplings[k]
-        for lane in range(LANES):
+        for lane in range(change.size):
             there[lane] += coupling * change[lane]
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST_MATH)
-def _quench_lanes(x, field, pairs, own, change, energy):
+def quench_lanes(x, field, pairs, own, change, energy):
     """Descend variable by variable until no lane changes; write the energies."""
     for _ in range(MOST_QUENCH_SWEEPS):
         n_all = F32(0)
         for i in range(x.shape[0]):
             mine, here, n_flipped = x[i], field[i], F32(0)
-            for lane in range(LANES):
+            for lane in range(change.size):
                 new = mine[lane] if here[lane] == F32(0) else F32(here[lane] < F32(0))
                 change[lane] = new - mine[lane]
                 mine[lane] = new
                 n_flipped += change[lane] * change[lane]
             if n_flipped > F32(0):
-                _spread(field, pairs, i, change)
+                spread(field, pairs, i, change)
                 n_all += n_flipped
         if n_all == F32(0):
             break
     energy[:] = F32(0)
     for i in range(x.shape[0]):
-        for lane in range(LANES):
+        for lane in range(change.size):
             energy[lane] += F32(0.5) * x[i, lane] * (field[i, lane] + own[i])

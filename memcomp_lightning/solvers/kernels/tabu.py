@@ -14,7 +14,7 @@ _FORBIDDEN = np.int32(LARGEST)
 
 @njit(nogil=True, cache=True)
 def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, best, found_at):
-    """Search from random states, restarts ``first_item`` to ``last_item - 1``.
+    """Search from the given states, restarts ``first_item`` to ``last_item - 1``.
 
     Each step flips the variable that lowers the energy most, or raises it least, among those that have not flipped
     lately. A variable that leads below the best energy may always flip. Where nothing better was found for long,
@@ -23,7 +23,7 @@ def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, 
     Args:
         first_item: Of ``n_problems * n_restarts``, problem after problem.
         last_item: One past the last.
-        stop: Of one number; other than 0 ends the work.
+        stop: Of one number; other than 0 ends the work with what was found so far.
         problem: Of int32: ``of_first (n_problems, n_first, n_second)`` and its transpose, for two full layers; or
             ``begins (n + 1,)``, ``neighbours (n_entries,)`` and ``couplings (n_problems, n_entries)``.
         own: The linear part, ``(n_problems, n)`` int32.
@@ -31,16 +31,19 @@ def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, 
         settings: Steps for which a variable does not flip back, the range of what is added to it at random, the
             steps without anything better before the search goes back, and the variables that it flips then.
         seeds: ``(n_items,)``.
-        best: Out, the best state, ``(n_items, n)`` in {0, 1}.
-        found_at: Out, its step, ``(n_items,)``.
+        best: In, where to start; out, the best state, ``(n_items, n)`` in {0, 1}.
+        found_at: Out, its step, ``(n_items,)``; stays what it is where no time was left.
     """
     tenure, spread, patience, n_kicked = settings
     n_problems, n = own.shape
     n_restarts = seeds.size // n_problems
     # change: of the energy if a variable flips. on: -1 (all bits) of a variable that is on, else 0.
-    change, on, on_at_best, free_from = np.empty((4, n), np.int32)
+    change, on = np.empty(n, np.int32), np.empty(n, np.int32)
+    on_at_best, free_from = np.empty(n, np.int32), np.empty(n, np.int32)
     state = np.empty(1, np.uint64)
     for item in range(first_item, last_item):
+        if stop[0] and item > first_item:
+            return
         p = item // n_restarts
         random.begin(state, seeds[item])
         change[:] = own[p]
@@ -48,17 +51,20 @@ def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, 
         free_from[:] = 0
         energy = np.int64(0)
         for i in range(n):
-            if random.draw(state) >> np.uint64(63):
+            if best[item, i]:
                 energy += change[i]
                 _flip(problem, p, i, change, on)
         lowest, lowest_at, on_at_best[:] = energy, 0, on
         lately, lately_at = energy, 0
         for step in range(1, n_steps + 1):
             if stop[0]:
-                return
+                break
             of_all, of_free = _smallest(change, free_from, step)
-            wanted, any_may = (of_all, True) if energy + of_all < lowest else (of_free, False)
-            i = _find(change, free_from, step, wanted, any_may, random.below(state, n))
+            wanted, latest = (of_all, _FORBIDDEN) if energy + of_all < lowest else (of_free, np.int32(step))
+            if wanted == _FORBIDDEN:
+                i = random.below(state, n)
+            else:
+                i = np.int64(_find(change, free_from, latest, wanted, np.int32(random.below(state, n))))
             energy += change[i]
             _flip(problem, p, i, change, on)
             free_from[i] = step + 1 + tenure + random.below(state, spread)
@@ -85,22 +91,25 @@ def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, 
 @njit(nogil=True, cache=True, forceinline=True)
 def _smallest(change, free_from, step):
     """The smallest change of all variables, and of those that may flip."""
-    of_all, of_free = _FORBIDDEN, _FORBIDDEN
+    of_all, of_free, now = _FORBIDDEN, _FORBIDDEN, np.int32(step)
     for i in range(change.size):
         of_all = min(of_all, change[i])
-        of_free = min(of_free, change[i] if free_from[i] <= step else _FORBIDDEN)
+        of_free = min(of_free, change[i] if free_from[i] <= now else _FORBIDDEN)
     return of_all, of_free
 
 
 @njit(nogil=True, cache=True, forceinline=True)
-def _find(change, free_from, step, wanted, any_may, start):
-    """The next variable from ``start`` on with this change; where none may flip, the one at ``start``."""
-    n = change.size
-    for k in range(n):
-        i = start + k if start + k < n else start + k - n
-        if change[i] == wanted and (any_may or free_from[i] <= step):
-            return i
-    return start
+def _find(change, free_from, latest, wanted, order):
+    """A variable with this change that is free at the latest step; of several the first after they are reordered.
+
+    Exclusive or with ``order`` reorders them, without a branch that vector code could not take.
+    """
+    first = _FORBIDDEN
+    for i in range(change.size):
+        place = np.int32(i) ^ order
+        fits = (change[i] == wanted) & (free_from[i] <= latest)
+        first = min(first, place if fits else _FORBIDDEN)
+    return first ^ order
 
 
 def _flip(problem, p, i, change, on):

@@ -17,6 +17,7 @@ from memcomp_lightning.solvers import (
     AlternatingDescent,
     BranchAndBound,
     BruteForce,
+    CrossoverAnnealing,
     GibbsAnnealing,
     Portfolio,
     Status,
@@ -266,6 +267,8 @@ SOLVERS = {
     "annealing, reference": GibbsAnnealing(n_restarts=7, n_sweeps=5, kernel="reference"),
     "tabu, compiled": TabuSearch(n_restarts=7, n_steps=30, kernel="compiled"),
     "tabu, reference": TabuSearch(n_restarts=7, n_steps=30, kernel="reference"),
+    "crossover, compiled": CrossoverAnnealing(n_restarts=7, n_sweeps=3, n_rounds=4, kernel="compiled"),
+    "crossover, reference": CrossoverAnnealing(n_restarts=7, n_sweeps=3, n_rounds=4, kernel="reference"),
     "best": Portfolio(n_restarts=9, effort=0.1),
     "clauses, compiled": machine(ClauseField(), "compiled"),
     "clauses, reference": machine(ClauseField(), "reference"),
@@ -355,10 +358,12 @@ assert not {"torch", "lightning", "matplotlib"} & set(sys.modules)
         GibbsAnnealing(kernel="reference"),
         TabuSearch(n_steps=5),
         TabuSearch(n_steps=5, kernel="reference"),
+        CrossoverAnnealing(n_sweeps=5, n_rounds=2),
+        CrossoverAnnealing(n_sweeps=5, n_rounds=2, kernel="reference"),
         DmmSolver(),
         DmmSolver(kernel="reference"),
     ],
-    ids=["descent", "annealing", "plain annealing", "tabu", "plain tabu", "compiled", "reference"],
+    ids=str,
 )
 def test_whole_numbers_are_searched_as_real_ones(solver, library):
     numbers = np.random.default_rng(0).integers(-9, 10, (40, 40))

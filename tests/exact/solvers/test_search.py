@@ -1,6 +1,8 @@
 """Rounds of a solver: when they end, what is kept of them, and what they say together."""
 
 import math
+import signal
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,9 +173,45 @@ def test_ctrl_c_returns_the_best_so_far():
     assert len(found.energies) == 6
     assert found.states[0].energy == min(found.energies)
     start = np.zeros((1, 14), np.bool_)
-    assert Search().run(dense(14), Interrupted(1), initial=start).states[0].energy == 0
+    assert Search().run(dense(14), Interrupted(1), initial=start).states[0].energy < 0, "better than the start"
     with pytest.raises(KeyboardInterrupt):
         Search().run(dense(14), Interrupted(1))
+
+
+ENDLESS = [TabuSearch(n_steps=10**12), GibbsAnnealing(n_sweeps=10**7), Portfolio(effort=1e3)]
+
+
+@pytest.mark.parametrize("solver", ENDLESS, ids=lambda solver: type(solver).__name__)
+def test_a_round_that_takes_too_long_is_ended(solver):
+    found = Search(time_limit=0.3).run(dense(150), solver)
+    assert found.wall_time_s < 30
+    assert Status.STOPPED in found.status
+    assert found.states[0].energy == min(energy for energy in found.energies if energy is not None)
+    within_a_moment = Search(time_limit=1e-9, n_solutions=2).run(dense(150), solver)
+    assert within_a_moment.states[0].energy <= 0, "something is always returned"
+
+
+@pytest.mark.parametrize("solver", ENDLESS, ids=lambda solver: type(solver).__name__)
+def test_ctrl_c_in_a_compiled_search_returns_the_best_so_far(solver):
+    qubo, start = dense(150), np.zeros((1, 150), np.bool_)
+    Search(time_limit=0.3).run(qubo, solver, initial=start)  # compiles
+    timer = threading.Timer(1.0, signal.pthread_kill, (threading.get_ident(), signal.SIGINT))
+    timer.start()
+    found = Search().run(qubo, solver, initial=start)
+    timer.join()
+    assert found.interrupted
+    assert found.states[0].energy < 0
+
+
+def test_initial_states_are_improved_on():
+    qubo = dense(60)
+    best = Search().run(qubo, Portfolio()).states[0]
+    near = best.values.copy()
+    near[:3] = ~near[:3]
+    weak = AlternatingDescent(n_restarts=1, max_sweeps=1)
+    found = Search().run(qubo, weak, initial=np.stack((np.zeros(60, np.bool_), near)))
+    assert found.states[0].energy == pytest.approx(best.energy)
+    assert found.energies > [best.energy], "not the restart, the initial state led there"
 
 
 def test_ctrl_c_in_a_callback_returns_what_it_was_called_with():
@@ -256,6 +294,7 @@ def ended(energies, status=(), best=None, **settings):
     status = [*status, *[Status.STEP_BUDGET] * (len(energies) - len(status))]
     best = min(energy for energy in energies if energy is not None) if best is None else best
     restarts = {"energies": energies, "broken": [0] * len(energies), "status": status, "steps": []}
+    restarts["population"] = list(range(len(energies)))
     return Found(states=[State(None, best, 0.0)], curve=[], **{**restarts, **settings})
 
 
@@ -268,6 +307,11 @@ def ended(energies, status=(), best=None, **settings):
         (ended([1.0] * 3 + [2.0] * 6 + [None] * 5), Status.AGREED, 3),
         (ended([1.0] * 3 + [2.0] * 7), Status.STEP_BUDGET, 3),
         (ended([1.0] * 3, best=0.5), Status.STEP_BUDGET, 0),
+        (ended([1.0] * 9, population=[0] * 9), Status.STEP_BUDGET, 9),
+        (ended([1.0] * 9, population=[0] * 8 + [1]), Status.AGREED, 9),
+        (ended([1.0] * 8 + [2.0], population=[0] * 7 + [1, 2]), Status.AGREED, 8),
+        (ended([1.0] * 8 + [2.0], population=[0] * 8 + [1]), Status.STEP_BUDGET, 8),
+        (ended([1.0, 1.0], population=[0, 1]), Status.STEP_BUDGET, 2),
         (ended([1.0] * 5, [Status.CONVERGED] * 3), Status.CONVERGED, 5),
         (ended([1.0] * 5, [Status.CONVERGED] * 2), Status.AGREED, 5),
         (ended([1.0, 1.0 + 1e-9, 1.0], resolution=1e-8), Status.AGREED, 3),

@@ -14,7 +14,8 @@ N_SWEEPS, N_BLOCKS = 40_000, 40
 
 def layered_states(problem: Layers, beta: np.float32, generator: np.random.Generator) -> np.ndarray:
     """States of a chain, half a sweep a layer, fields kept by events."""
-    of_first, of_second, own = (float32(part[0]) for part in problem)
+    of_first, of_second = (part[0] for part in problem.rows(float32))
+    own = float32(problem.own[0])
     n_first, n = len(of_first), len(own)
     x, field, flipped = np.zeros(n, np.float32), own.copy(), np.empty(n + 1, np.int64)
     pool, states = random.thresholds(n), np.empty((N_SWEEPS, n))
@@ -38,7 +39,7 @@ def listed_states(problem, beta, generator):
     states = np.empty((N_SWEEPS // annealing.LANES, n, annealing.LANES))
     for sweep in range(len(states)):
         at = generator.integers(random.N_THRESHOLDS)
-        annealing._sweep_lanes(x, field, pairs, pool, at, beta, change)
+        annealing.sweep_lanes(x, field, pairs, pool, at, beta, change)
         states[sweep] = x
     return states.transpose(0, 2, 1).reshape(-1, n)
 

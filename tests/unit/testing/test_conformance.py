@@ -22,7 +22,14 @@ from memcomp_lightning.samplers import (
     ParallelTempering,
     Quench,
 )
-from memcomp_lightning.solvers import AlternatingDescent, BruteForce, GibbsAnnealing, Portfolio, TabuSearch
+from memcomp_lightning.solvers import (
+    AlternatingDescent,
+    BruteForce,
+    CrossoverAnnealing,
+    GibbsAnnealing,
+    Portfolio,
+    TabuSearch,
+)
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
 from memcomp_lightning.training import Greedy
@@ -47,6 +54,10 @@ SOLVERS = {
     "annealing in plain operations": GibbsAnnealing(n_restarts=53, kernel="reference"),
     "tabu": TabuSearch(n_restarts=11),
     "tabu in plain operations": TabuSearch(n_restarts=11, n_steps=101, kernel="reference"),
+    "crossover": CrossoverAnnealing(n_restarts=11, n_sweeps=20),
+    "crossover in plain operations": CrossoverAnnealing(
+        n_restarts=11, n_sweeps=20, n_rounds=5, kernel="reference"
+    ),
     "best": Portfolio(n_restarts=11),
     "brute force": BruteForce(),
     "brute force in chunks": BruteForce(chunk_size=13),

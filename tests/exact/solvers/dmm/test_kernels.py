@@ -1,6 +1,8 @@
 """The compiled kernels against the readable one, step by step and after many steps."""
 
+import ast
 import dataclasses
+import inspect
 import os
 import re
 import time
@@ -24,7 +26,7 @@ from memcomp_lightning.solvers.dmm.kernels import common, cpu, lanes, prepare, r
 from memcomp_lightning.solvers.dmm.kernels import digital as digital_state
 from memcomp_lightning.solvers.dmm.kernels import fields as compiled_fields
 from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
-from memcomp_lightning.solvers.kernels import annealing, branch_and_bound, tabu
+from memcomp_lightning.solvers.kernels import annealing, branch_and_bound, crossover, tabu
 
 # Small steps and slow memories, so that rounding errors stay small for some steps: the machines are chaotic.
 SLOW = Splitting(change=0.3, dt_min=0.01, dt_max=0.4, lag=0.2)
@@ -654,7 +656,13 @@ def test_passes_of_the_page_take_the_same_steps():
 
 
 ENTRIES = {"rows.integrate_all", "lanes.integrate_all", "prepare.prepare", "branch_and_bound.search"}
-ENTRIES |= {"kernel.sum_over_second", "annealing.anneal_layers", "annealing.anneal_pairs", "tabu.search"}
+ENTRIES |= {
+    "kernel.sum_over_second",
+    "annealing.anneal_layers",
+    "annealing.anneal_pairs",
+    "tabu.search",
+    "crossover.evolve",
+}
 
 
 def test_constants_have_the_names_of_their_places():
@@ -662,7 +670,26 @@ def test_constants_have_the_names_of_their_places():
         assert [getattr(common, name.upper()) for name in names] == list(range(len(names)))
 
 
-COMPILED = [common, digital_state, rows, lanes, prepare, branch_and_bound, annealing, tabu, likelihood_kernel]
+COMPILED = [
+    common,
+    digital_state,
+    rows,
+    lanes,
+    prepare,
+    branch_and_bound,
+    annealing,
+    crossover,
+    tabu,
+    likelihood_kernel,
+]
+
+
+@pytest.mark.parametrize("module", COMPILED, ids=lambda module: module.__name__)
+def test_arrays_of_a_kernel_are_contiguous(module):
+    """Numba takes the rows of an array that is unpacked for strided ones, which vector code cannot read."""
+    for node in ast.walk(ast.parse(inspect.getsource(module))):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):
+            assert not (isinstance(node.value, ast.Call) and "np." in ast.unparse(node.value.func)), node.lineno
 
 
 @pytest.mark.parametrize("module", COMPILED, ids=lambda module: module.__name__)
