@@ -14,11 +14,10 @@ import dimod
 import numpy as np
 import torch
 from dwave.samplers import SimulatedAnnealingSampler, TabuSampler
-from quadratise import quadratise
 from torch import Tensor
 
 from memcomp_lightning.arrays import to_numpy
-from memcomp_lightning.problems import Qubo, WeightedMaxSat
+from memcomp_lightning.problems import Qubo, WeightedMaxSat, as_qubo
 
 Problem = Qubo | WeightedMaxSat
 
@@ -67,7 +66,7 @@ class Model(NamedTuple):
 def model(problem: Problem) -> Model:
     """The spin form of a problem; the last two are kept."""
     begin = time.perf_counter()
-    qubo = quadratise(problem)
+    qubo = as_qubo(problem)
     pairs, coupling = to_numpy(qubo.graph.edges()), qubo.coupling.double().flatten().numpy()
     used = coupling != 0
     (i, j), coupling = pairs[used].T, coupling[used]

@@ -11,12 +11,11 @@ import simulated_bifurcation
 import torch
 from dwave.samplers import SteepestDescentSampler
 from opponents import Opponent, Problem, Reads, SimulatedAnnealing, Tabu, answer, energies, model
-from quadratise import quadratise
 from simulated_bifurcation.core import Ising
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.problems import Bipartite
+from memcomp_lightning.problems import Bipartite, as_qubo
 from memcomp_lightning.solvers import (
     AlternatingDescent,
     CrossoverAnnealing,
@@ -51,7 +50,7 @@ class Descent:
     variants: ClassVar[tuple[Mapping[str, Any], ...]] = ({},)
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        qubo = quadratise(problem)
+        qubo = as_qubo(problem)
         if not isinstance(qubo.graph, Bipartite):
             bqm, _, build = model(problem)
             begin = time.perf_counter()
@@ -137,7 +136,7 @@ class OfThePackage:
         raise NotImplementedError
 
     def run(self, problem: Problem, *, n_reads: int, budget: int, seed: int) -> Reads:
-        given = problem if self.takes_clauses else quadratise(problem)
+        given = problem if self.takes_clauses else as_qubo(problem)
         generator = rng.stream(seed, self.name)
 
         def part(n: int) -> tuple[Tensor, float]:

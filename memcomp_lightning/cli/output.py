@@ -17,6 +17,9 @@ _PLAIN = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{PLUS-MINUS SIGN}": "+-",
 USAGE_ERROR = 2
 """Exit status when a setting is refused."""
 
+NOT_FEASIBLE = 3
+"""Exit status when the answer breaks a hard clause: there is no other, or none was found."""
+
 
 def refuse(command: str, error: Exception) -> NoReturn:
     """End the command with an error message, without a traceback."""

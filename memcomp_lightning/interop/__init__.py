@@ -3,6 +3,6 @@
 from memcomp_lightning.interop.annealer_graph import annealer_graph
 from memcomp_lightning.optional import on_demand
 
-__all__ = ["DmmDimodSampler", "QpuSampler", "annealer_graph"]
+__all__ = ["MemcompSampler", "QpuSampler", "annealer_graph"]
 
-__getattr__ = on_demand(__name__, {"DmmDimodSampler": "dmm_sampler", "QpuSampler": "qpu"})
+__getattr__ = on_demand(__name__, {"MemcompSampler": "memcomp_sampler", "QpuSampler": "qpu"})

@@ -1,13 +1,14 @@
-"""QUBO and weighted MAX-SAT: problems, their files, and the exact mappings between them."""
+"""QUBO and weighted MAX-SAT, with constraints or without: problems, their files, exact mappings between them."""
 
 from memcomp_lightning.optional import on_demand
+from memcomp_lightning.problems.constrained import Constrained, Linear, clause, exactly
 from memcomp_lightning.problems.files.formats import FORMATS
 from memcomp_lightning.problems.files.numbers import in_full
 from memcomp_lightning.problems.files.objective import Score
 from memcomp_lightning.problems.files.source import ProblemFileError
 from memcomp_lightning.problems.from_model import from_model
 from memcomp_lightning.problems.graph import Bipartite, EdgeList, Graph
-from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, from_qubo, to_qubo
+from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, as_qubo, from_qubo, to_qubo
 from memcomp_lightning.problems.problem import Problem, read_problem
 from memcomp_lightning.problems.qubo import Qubo
 
@@ -15,13 +16,18 @@ __all__ = [
     "FORMATS",
     "Bipartite",
     "Clauses",
+    "Constrained",
     "EdgeList",
     "Graph",
+    "Linear",
     "Problem",
     "ProblemFileError",
     "Qubo",
     "Score",
     "WeightedMaxSat",
+    "as_qubo",
+    "clause",
+    "exactly",
     "from_model",
     "from_qubo",
     "in_full",
@@ -29,4 +35,4 @@ __all__ = [
     "to_qubo",
 ]
 
-__getattr__ = on_demand(__name__, {"from_bqm": "bqm", "to_bqm": "bqm"})
+__getattr__ = on_demand(__name__, {"from_bqm": "bqm", "from_cqm": "cqm", "to_bqm": "bqm"})

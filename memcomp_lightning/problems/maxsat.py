@@ -1,15 +1,26 @@
-"""Weighted MAX-SAT: clauses of any length, and the exact equivalence of its two-literal form with QUBO."""
+"""Weighted MAX-SAT: clauses of any length, and its exact equivalence with QUBO."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 
-from memcomp_lightning.arrays import AnyArray, Array, add_up, alike, as_array, cast, double, namespace
+from memcomp_lightning.arrays import (
+    AnyArray,
+    Array,
+    add_up,
+    alike,
+    as_array,
+    cast,
+    double,
+    namespace,
+    to_numpy,
+)
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import EdgeList, Graph
 from memcomp_lightning.problems.qubo import Qubo, wide
+from memcomp_lightning.problems.rows import Rows, plus_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +41,12 @@ class Clauses:
         """Total weight of unsatisfied clauses in float64, ``(*problems, n_states)``, of states in {0, 1}."""
         false = (x[..., self.variables] > 0.5) != (self.polarity > 0)
         return (double(false.all(-1)) @ double(self.weight)[..., None])[..., 0]
+
+    def rows(self) -> Rows:
+        """At least one literal is true: a row for each clause."""
+        polarity = to_numpy(self.polarity).astype(np.int64)
+        n_negated = (polarity < 0).sum(1)
+        return Rows(to_numpy(self.variables), polarity, 1 - n_negated, polarity.shape[1] - 1, self.weight)
 
     def field(self, x: Array) -> Array:
         """Unsatisfied weight of x_i = 1 less that of x_i = 0, ``(*problems, n_states, n)``."""
@@ -78,6 +95,48 @@ class WeightedMaxSat:
     def without_longer(self) -> "WeightedMaxSat":
         """The same problem without its clauses of three literals and more."""
         return replace(self, longer=())
+
+    def plus_clauses(self, blocks: Iterable[Clauses]) -> "WeightedMaxSat":
+        """Add clauses, of one length a block; their variables are sorted."""
+        xp, flat = namespace(self.unit), (*self.problems, -1)
+        pairs, unit, offset = [alike(self.graph.edges(), self.unit)], self.unit, double(self.offset)
+        weight = [self.weight.reshape(flat)]
+        ends = [[xp.broadcast_to(part, self.weight.shape).reshape(flat)] for part in (self.first, self.second)]
+        longer = {block.variables.shape[1]: block for block in self.longer}
+        for block in blocks:
+            length = block.variables.shape[1]
+            if length == 0:
+                offset = offset + double(block.weight).sum(-1)
+            elif length == 1:
+                pull = block.weight * block.polarity[:, 0]
+                before, unit = unit, unit + add_up(pull, block.variables[:, 0], self.n)
+                # A unit u costs max(u, 0) - u x.
+                offset = offset + double(pull.clip(min=0)).sum(-1)
+                offset = offset + (double(before).clip(min=0) - double(unit).clip(min=0)).sum(-1)
+            elif length == 2:
+                pairs.append(block.variables)
+                weight.append(block.weight)
+                for k, end in enumerate(ends):
+                    end.append(xp.broadcast_to(block.polarity[:, k], block.weight.shape))
+            elif length in longer:
+                both = longer[length], block
+                longer[length] = Clauses(
+                    variables=xp.concat([part.variables for part in both]),
+                    polarity=xp.concat([part.polarity for part in both]),
+                    weight=xp.concat([part.weight for part in both], axis=-1),
+                )
+            else:
+                longer[length] = block
+        first, second = (xp.concat(end, axis=-1) for end in ends)
+        return WeightedMaxSat(
+            graph=EdgeList(n=self.n, pairs=xp.concat(pairs)),
+            weight=xp.concat(weight, axis=-1),
+            first=first,
+            second=second,
+            unit=unit,
+            offset=offset,
+            longer=tuple(longer[length] for length in sorted(longer)),
+        )
 
     def alike(self, like: AnyArray) -> "WeightedMaxSat":
         """The same problem in the library and on the device of ``like``: a tensor, as to solve it on a GPU."""
@@ -230,26 +289,24 @@ def to_qubo(maxsat: WeightedMaxSat) -> Qubo:
     """Return the QUBO whose energy is unsatisfied weight + offset, for every x; inverse of :func:`from_qubo`.
 
     (1 + q) / 2 - q x is 1 where a literal of polarity q is false, else 0; a clause costs its weight times the
-    product of two of these.
-
-    Raises:
-        SettingError: The problem has clauses of three literals or more.
+    product of two of these. Clauses of three literals and more take auxiliary variables, see
+    :mod:`~memcomp_lightning.problems.rows`: these come after the n variables, and the energy is the one of their
+    best values.
     """
-    require(
-        not maxsat.longer,
-        "longest clause",
-        max((block.variables.shape[-1] for block in maxsat.longer), default=2),
-        "at most 2 literals",
-        "Longer clauses are no QUBO without auxiliary variables: solve them with DmmSolver(field=ClauseField()).",
-    )
     constant_first, constant_second = (1 + maxsat.first) // 2, (1 + maxsat.second) // 2
     linear = maxsat.graph.scatter(
         -maxsat.weight * maxsat.first * constant_second, -maxsat.weight * maxsat.second * constant_first
     )
     constant = wide(maxsat.weight * constant_first * constant_second).sum(edge_axes(maxsat.graph))
-    return Qubo(
+    short = Qubo(
         graph=maxsat.graph,
         coupling=maxsat.weight * maxsat.first * maxsat.second,
         linear=linear - maxsat.unit,
         offset=maxsat.offset + constant + wide(maxsat.unit).clip(min=0).sum(-1),
     )
+    return plus_rows(short, [block.rows() for block in maxsat.longer]) if maxsat.longer else short
+
+
+def as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
+    """The problem as a QUBO, which every solver takes; auxiliary variables of long clauses come last."""
+    return problem if isinstance(problem, Qubo) else to_qubo(problem)

@@ -8,7 +8,10 @@ from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, RecordedSta
 from memcomp_lightning.solvers.best import Portfolio
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.solvers.crossover import CrossoverAnnealing
+from memcomp_lightning.solvers.found import Found, State
+from memcomp_lightning.solvers.search import Search
 from memcomp_lightning.solvers.tabu import TabuSearch
 
 __all__ = [
@@ -17,11 +20,15 @@ __all__ = [
     "BranchAndBound",
     "BruteForce",
     "CrossoverAnnealing",
+    "Found",
     "GibbsAnnealing",
+    "PenaltyLoop",
     "Portfolio",
     "QuboSolution",
     "QuboSolver",
     "RecordedStates",
+    "Search",
+    "State",
     "Status",
     "TabuSearch",
     "write_solution",

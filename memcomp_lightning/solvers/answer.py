@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning import __version__
-from memcomp_lightning.arrays import namespace
+from memcomp_lightning.arrays import as_array, namespace, to_numpy
 from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
 from memcomp_lightning.problems.files.numbers import Exact, in_full
 from memcomp_lightning.problems.files.objective import Score
 from memcomp_lightning.problems.problem import Problem
 from memcomp_lightning.solvers.base import QuboSolution, Status
+from memcomp_lightning.solvers.found import Found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,8 +31,8 @@ class Answer:
         energy: Its energy: the score's value, or minus it if that is maximised, plus the penalty of each
             unsatisfied hard clause.
         energies: Energy of each restart; None where it was not run.
-        status: How each restart ended. A proven minimum that leaves a hard clause unsatisfied is INFEASIBLE, one
-            that rests on rounded sums ROUNDED.
+        status: How each restart ended. A proven minimum that leaves a hard clause unsatisfied is INFEASIBLE,
+            another answer that does NOT_FEASIBLE; a minimum that rests on rounded sums is ROUNDED.
     """
 
     assignment: NDArray[np.bool_]
@@ -56,36 +57,55 @@ class Answer:
         return Status.OPTIMAL in self.status
 
     @staticmethod
-    def of(problem: Problem, solution: QuboSolution) -> "Answer":
-        """What a solver found of ``problem.problem`` or ``problem.integers``, in the terms of the problem's file.
+    def of(problem: Problem, solution: QuboSolution | Found) -> "Answer":
+        """What a solver or a search found of the problem, in the terms of the problem's file.
 
         Raises:
             SettingError: The solution is of more than one problem.
         """
-        require(solution.energies.ndim == 1, "energies' shape", tuple(solution.energies.shape), "(n_restarts,)")
-        # Solvers return the dtype of what they were given: integers were compared as integers.
-        exact = problem.resolved or solution.assignments.dtype == namespace(solution.assignments).int64
-        status = [Status(code) for code in solution.status.tolist()]
-        energies: list[Exact | float | None] = [None] * len(status)
-        found: list[tuple[Exact | float, int, Score]] = []
-        for k, rounded in enumerate(solution.energies.tolist()):
-            if not math.isfinite(rounded):
-                continue
-            score = problem.score(solution.assignments[k])
-            energies[k] = energy = problem.objective.energy(score)
-            found.append((energy, k, score))
-            if status[k] is Status.OPTIMAL and not exact:
-                status[k] = Status.ROUNDED
-            elif status[k] is Status.OPTIMAL and score.hard_unsatisfied:
-                status[k] = Status.INFEASIBLE
-        energy, best, score = min(found)
-        return Answer(problem.expand(solution.assignments[best] > 0.5), score, energy, energies, status)
+        if isinstance(solution, Found):
+            best, energies, status = solution.states[0].values, solution.energies, solution.status
+        else:
+            energies, _, status = in_full_of(problem, solution)
+            _, k = min((energy, k) for k, energy in enumerate(energies) if energy is not None)
+            best = to_numpy(solution.assignments[k]) > 0.5
+        score = problem.score(as_array(best))
+        return Answer(problem.expand(as_array(best)), score, problem.objective.energy(score), energies, status)
+
+
+def in_full_of(
+    problem: Problem, solution: QuboSolution
+) -> tuple[list[Exact | float | None], list[int], list[Status]]:
+    """Energy, unsatisfied hard clauses and status of each restart as an :class:`Answer` has them.
+
+    Raises:
+        SettingError: The solution is of more than one problem.
+    """
+    require(solution.energies.ndim == 1, "energies' shape", tuple(solution.energies.shape), "(n_restarts,)")
+    # Solvers return the dtype of what they were given: integers were compared as integers.
+    exact = problem.resolved or solution.assignments.dtype == namespace(solution.assignments).int64
+    status = [Status(code) for code in solution.status.tolist()]
+    energies: list[Exact | float | None] = [None] * len(status)
+    broken = [0] * len(status)
+    for k, rounded in enumerate(solution.energies.tolist()):
+        if not math.isfinite(rounded):
+            continue
+        score = problem.score(solution.assignments[k])
+        energies[k], broken[k] = problem.objective.energy(score), score.hard_unsatisfied
+        if status[k] is Status.OPTIMAL and not exact:
+            status[k] = Status.ROUNDED
+        if score.hard_unsatisfied:
+            proven = status[k] in (Status.OPTIMAL, Status.INFEASIBLE)
+            status[k] = Status.INFEASIBLE if proven else Status.NOT_FEASIBLE
+    return energies, broken, status
 
 
 def write_solution(
-    path: Path, problem: Problem, solution: QuboSolution, *, solver: Mapping[str, object], seed: int
+    path: Path, problem: Problem, solution: QuboSolution | Found, *, solver: Mapping[str, object], seed: int
 ) -> None:
     """Write the answer to one problem as JSON, whole or not at all, with the solver's settings and its seed.
+
+    Of a search it has the states that were kept and the curve, too.
 
     Raises:
         SettingError: The answer is to more than one problem.
@@ -112,10 +132,11 @@ def write_solution(
         **_in_json("energy", answer.energy),
         "objective": objective,
         "assignment": answer.assignment,
+        **(_of_search(problem, solution) if isinstance(solution, Found) else {}),
         "restarts": {
             "energy": [None if energy is None else _nearest(energy) for energy in answer.energies],
             "status": [status.name for status in answer.status],
-            "steps": solution.steps.tolist(),
+            "steps": solution.steps if isinstance(solution, Found) else solution.steps.tolist(),
         },
         "wall_time_s": solution.wall_time_s,
         "solver": dict(solver),
@@ -124,6 +145,21 @@ def write_solution(
     }
     lines = ",\n".join(f" {json.dumps(name)}: {_json(value)}" for name, value in content.items())
     write_text(path, f"{{\n{lines}\n}}\n")
+
+
+def _of_search(problem: Problem, found: Found) -> dict[str, object]:
+    """What a search knows beyond its best state."""
+    others = [
+        {"assignment": problem.expand(state.values).astype(int).tolist(), **_in_json("energy", state.energy)}
+        for state in found.states[1:]
+    ]
+    bound = {"lower_bound": found.lower_bound} if math.isfinite(found.lower_bound) else {}
+    return {
+        "status": found.conclusion.name,
+        **bound,
+        "curve": [[round(seconds, 6), _nearest(energy)] for seconds, energy in found.curve],
+        **({"other_solutions": others} if others else {}),
+    }
 
 
 def _json(value: object) -> str:

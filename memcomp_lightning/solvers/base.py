@@ -34,7 +34,9 @@ class Status(IntEnum):
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
     INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
-    STOPPED = 8, "The time was up, or Ctrl-C came: a longer search may find a lower one."
+    NOT_FEASIBLE = 8, "No assignment that keeps all constraints was found; more restarts may find one."
+    STOPPED = 9, "The time was up, or Ctrl-C came: a longer search may find a lower one."
+    AGREED = 10, "Not proven, but many independent restarts reached this energy and none went below it."
 
 
 class RecordedStates(Protocol):
@@ -59,6 +61,10 @@ class QuboSolution:
         steps: ``(*problems, n_restarts)`` int64, integration steps or sweeps done.
         wall_time_s: Seconds for all problems and restarts together.
         trajectory: What the solver passed through, if it was asked to record it.
+        broken: Number of constraints that each assignment breaks, ``(*problems, n_restarts)`` int64; None where
+            the problem has none.
+        population: Number of the population of each restart, ``(*problems, n_restarts)`` int64: those of one are
+            not independent. None where each is on its own.
     """
 
     assignments: Array
@@ -67,18 +73,29 @@ class QuboSolution:
     steps: Array
     wall_time_s: float
     trajectory: RecordedStates | None = None
+    broken: Array | None = None
+    population: Array | None = None
 
     @property
     def best_energy(self) -> Array:
-        """Lowest energy over the restarts, ``(*problems,)`` float64."""
-        return namespace(self.energies).min(self.energies, axis=-1)
+        """Energy of :attr:`best`, ``(*problems,)`` float64."""
+        return namespace(self.energies).min(self._ranked, axis=-1)
 
     @property
     def best(self) -> Array:
-        """Assignment of lowest energy, ``(*problems, n)``."""
-        xp, index = namespace(self.energies), self.energies.argmin(-1)[..., None, None]
+        """Assignment of lowest energy among those that break the fewest constraints, ``(*problems, n)``."""
+        xp, index = namespace(self.energies), self._ranked.argmin(-1)[..., None, None]
         index = xp.broadcast_to(index, (*index.shape[:-1], self.assignments.shape[-1]))
         return xp.take_along_axis(self.assignments, index, axis=-2)[..., 0, :]
+
+    @property
+    def _ranked(self) -> Array:
+        """Energies, infinite where another assignment breaks fewer constraints."""
+        if self.broken is None:
+            return self.energies
+        xp = namespace(self.energies)
+        fewest = xp.min(self.broken, axis=-1)[..., None]
+        return xp.where(self.broken == fewest, self.energies, xp.inf)
 
     def lowest(self, n: int) -> "QuboSolution":
         """The ``n`` restarts of lowest energy of each problem, lowest first, or all if they are fewer."""
@@ -90,6 +107,7 @@ class QuboSolution:
             energies=xp.take_along_axis(self.energies, order, axis=-1),
             status=xp.take_along_axis(self.status, order, axis=-1),
             steps=xp.take_along_axis(self.steps, order, axis=-1),
+            population=None if self.population is None else xp.take_along_axis(self.population, order, axis=-1),
         )
 
     def messages(self) -> dict[str, int]:

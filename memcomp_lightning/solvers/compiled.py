@@ -271,7 +271,7 @@ def share(
         wait(jobs)
         if limit is None or not isinstance(error, KeyboardInterrupt):
             raise
-        limit.interrupted = True
+        limit.until, limit.interrupted = 0.0, True
         return False
 
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -81,13 +81,16 @@ class CrossoverAnnealing:
         """Return the best states of the populations, best first."""
         begin = time.perf_counter() - compiling.seconds_spent()
         qubo = listed(qubo.floating())
-        compiled = self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0
-        x, was_run, in_time = (
-            self._compiled(qubo, generator) if compiled else (self._reference(qubo, generator), None, True)
-        )
+        if self.kernel != "reference" and obstacle(device_of(qubo.linear)) is None and qubo.n > 0:
+            from memcomp_lightning.solvers.kernels.annealing import LANES
+
+            (x, was_run, in_time), size = self._compiled(qubo, generator), LANES
+        else:
+            x, was_run, in_time, size = self._reference(qubo, generator), None, True, self.n_restarts
         n_sweeps = self.n_sweeps + self.n_rounds * self._n_short
         solution = solution_of(qubo, x, begin, steps=n_sweeps, was_run=was_run, in_time=in_time)
-        return solution.lowest(self.n_restarts)
+        numbers = np.broadcast_to(np.arange(x.shape[-2]) // size, x.shape[:-1])
+        return replace(solution, population=alike(numbers, solution.steps)).lowest(self.n_restarts)
 
     @property
     def _n_short(self) -> int:

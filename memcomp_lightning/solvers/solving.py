@@ -1,44 +1,69 @@
-"""Hand a problem from a file to a solver in the form that it takes, and refuse what memory cannot hold."""
+"""Hand a problem to a solver in the form that it takes, and refuse what memory cannot hold."""
 
 import math
 import os
+from typing import TYPE_CHECKING
 
-from memcomp_lightning import rng
 from memcomp_lightning.errors import UserError, require
-from memcomp_lightning.problems import Bipartite, Problem, Qubo, WeightedMaxSat, to_qubo
+from memcomp_lightning.problems import Bipartite, Constrained, Problem, Qubo, WeightedMaxSat, as_qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
 from memcomp_lightning.solvers.branch_and_bound import BranchAndBound
 from memcomp_lightning.solvers.brute_force import BruteForce
+from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.solvers.dmm import DmmSolver, default_steps
+
+if TYPE_CHECKING:
+    from memcomp_lightning.rng import Generator
+
+Given = Problem | Constrained | Qubo | WeightedMaxSat
+"""One problem, from a file or not."""
 
 MOST_RECORDED = 4 * 2**30
 """Bytes of a trajectory that a common computer's memory holds."""
 
 
-def minimise(problem: Problem, solver: QuboSolver, seed: int) -> QuboSolution:
-    """The solver's answer; without variables there is one state, and no solver has to look for it."""
-    generator, given = rng.numpy_stream(seed, "solver"), problem.problem
+def minimise(problem: Given, solver: QuboSolver, generator: "Generator") -> QuboSolution:
+    """The solver's answer, with penalties for constraints as they need them where it proves nothing.
+
+    Without variables there is one state, and no solver has to look for it.
+    """
+    given, constrained = numbers_of(problem), constrained_of(problem)
     if given.n == 0:
         return BruteForce().minimise(as_qubo(given), generator=generator)
     try:
-        if isinstance(solver, DmmSolver):
-            return solver.minimise(given, generator=generator)
-        exact = problem.integers if isinstance(solver, BruteForce) and not problem.resolved else None
-        return solver.minimise(as_qubo(given) if exact is None else exact, generator=generator)
+        proves = isinstance(solver, BruteForce) and isinstance(problem, Problem)
+        if proves and isinstance(problem, Problem) and problem.integers is not None and not problem.resolved:
+            return solver.minimise(problem.integers, generator=generator)
+        if constrained is not None and not proves:
+            return PenaltyLoop(solver=solver).minimise(constrained, generator=generator)
+        if getattr(solver, "takes_clauses", False):
+            return solver.minimise(given, generator=generator)  # type: ignore[arg-type]
+        if isinstance(given, WeightedMaxSat) and given.longer:
+            return PenaltyLoop(solver=solver).minimise(Constrained.of(given, []), generator=generator)
+        return solver.minimise(as_qubo(given), generator=generator)
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MemoryError) or "memory" in str(error):
             raise UserError(_too_large(problem, solver)) from error
         raise
 
 
-def as_qubo(problem: Qubo | WeightedMaxSat) -> Qubo:
-    """The problem as a QUBO, which every solver takes; DmmSolver takes clauses as they are."""
-    return problem if isinstance(problem, Qubo) else to_qubo(problem)
+def numbers_of(problem: Given) -> Qubo | WeightedMaxSat:
+    """What is minimised of it; of a file with hard clauses their penalties, too."""
+    if isinstance(problem, Constrained):
+        return problem.objective
+    return problem.problem if isinstance(problem, Problem) else problem
 
 
-def check_memory(problem: Problem, solver: QuboSolver) -> None:
+def constrained_of(problem: Given) -> Constrained | None:
+    """The problem with its constraints apart; None without any."""
+    if isinstance(problem, Problem):
+        return problem.constrained
+    return problem if isinstance(problem, Constrained) else None
+
+
+def check_memory(problem: Given, solver: QuboSolver) -> None:
     """Refuse, before anything is solved, a trajectory or states of restarts that memory could not hold."""
-    given = problem.problem
+    given = numbers_of(problem)
     if isinstance(solver, DmmSolver) and solver.record is not None:
         n_bytes = solver.n_restarts * (solver.max_steps or default_steps(given)) * given.n
         every, remedy = solver.record.every, "To record nothing, use solver=dmm."
@@ -71,15 +96,19 @@ def _installed() -> float:
         return math.inf
 
 
-def _too_large(problem: Problem, solver: QuboSolver) -> str:
+def _too_large(problem: Given, solver: QuboSolver) -> str:
     """Why the solver does not fit, and what to do."""
-    sizes = ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in problem.sizes.items())
+    given = numbers_of(problem)
+    whose, counts = "", {"variables": given.n, "couplings": math.prod(given.graph.edge_shape)}
+    if isinstance(problem, Problem):
+        whose, counts = f"{problem.path}: ", problem.sizes
+    sizes = ", ".join(f"{number} {kind.replace('_', ' ')}" for kind, number in counts.items())
     restarts = getattr(solver, "n_restarts", None)
     each = "" if restarts is None else f" with solver.n_restarts = {restarts}"
     remedy = "a smaller problem" if restarts in (None, 1) else "fewer restarts, as solver.n_restarts=1"
-    sizes_in_bytes = memory_needed(problem.problem, solver), _installed()
+    sizes_in_bytes = memory_needed(given, solver), _installed()
     needed, installed = (f"{n_bytes / 2**30:.0f} GiB" for n_bytes in sizes_in_bytes)
     return (
-        f"{problem.path}: {sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
+        f"{whose}{sizes}. {type(solver).__name__}{each} needs about {needed} of memory, "
         f"more than there is ({installed}): try {remedy}."
     )

@@ -200,11 +200,11 @@ def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_pat
 def test_imports_without_extras(python: Path, tmp_path: Path) -> None:
     code = """
 import importlib, pkgutil, memcomp_lightning
-needs = ("problems.bqm", "solvers.dimod", "samplers.annealer", "interop.dmm_sampler", "interop.qpu")
+needs = ("problems.bqm", "solvers.dimod", "samplers.annealer", "interop.memcomp_sampler", "interop.qpu")
 for module in pkgutil.walk_packages(memcomp_lightning.__path__, "memcomp_lightning."):
     if not module.name.endswith(needs):
         importlib.import_module(module.name)
-named = {"solvers": ["DimodSolver"], "samplers": ["AnnealerSamples"], "interop": ["DmmDimodSampler", "QpuSampler"]}
+named = {"solvers": ["DimodSolver"], "samplers": ["AnnealerSamples"], "interop": ["MemcompSampler", "QpuSampler"]}
 for package, name in [(package, name) for package, names in named.items() for name in names]:
     try:
         getattr(getattr(memcomp_lightning, package), name)
@@ -213,7 +213,7 @@ for package, name in [(package, name) for package, names in named.items() for na
 """
     out = run_warm(python, "-c", code, folder=tmp_path)
     extras = re.findall(r"^(\w+) .*pip install 'memcomp-lightning\[(\w+)\]'\.$", out, flags=re.MULTILINE)
-    names = ("DimodSolver", "AnnealerSamples", "DmmDimodSampler", "QpuSampler")
+    names = ("DimodSolver", "AnnealerSamples", "MemcompSampler", "QpuSampler")
     assert extras == list(zip(names, ("dimod", "dimod", "dimod", "dwave"), strict=True))
 
 

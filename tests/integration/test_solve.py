@@ -106,12 +106,42 @@ def test_integers_are_printed_whole(memcomp_solve: Solve) -> None:
     assert json.loads(Path("run/solution.json").read_text())["objective"]["value"] == 2**54 + 300
 
 
-def test_a_broken_hard_clause_is_no_solution(memcomp_solve: Solve) -> None:
+@pytest.mark.parametrize(
+    ("solver", "status"),
+    [
+        ("brute_force", "1 x INFEASIBLE"),
+        ("best", "x INFEASIBLE"),
+        ("annealing", "x NOT_FEASIBLE"),
+        ("dmm_recorded", "x NOT_FEASIBLE"),
+    ],
+)
+def test_a_broken_hard_clause_is_no_solution(memcomp_solve: Solve, solver: str, status: str) -> None:
     Path("none.wcnf").write_text("h 1 0\nh -1 0\n4 -2 0\nh 2 1 0\n")
-    outcome = memcomp_solve("problem=none.wcnf", "solver=brute_force", FAST[2])
+    outcome = memcomp_solve("problem=none.wcnf", f"solver={solver}", FAST[2])
+    assert outcome.status == 3
     assert "1 unsatisfied: this is no solution" in outcome.out
-    assert "1 x INFEASIBLE" in outcome.out
+    assert status in outcome.out
     assert "OPTIMAL" not in outcome.out
+    found = json.loads(Path("run/solution.json").read_text())
+    assert found["objective"] == {**found["objective"], "value": 0, "hard_clauses_unsatisfied": 1}
+
+
+def test_no_sweep_ends_where_a_problem_has_no_solution(memcomp_solve: Solve) -> None:
+    Path("none.wcnf").write_text("h 1 0\nh -1 0\n")
+    outcome = memcomp_solve("-m", "problem=none.wcnf,pairs.wcnf", "solver=brute_force", "hydra.sweep.dir=sweep")
+    assert "this is no solution" in outcome.out
+    assert len(list(Path("sweep").rglob("solution.json"))) == 2
+
+
+@pytest.mark.parametrize("solver", ["best", "annealing", "tabu", "dmm"])
+def test_hard_clauses_hide_nothing(memcomp_solve: Solve, solver: str) -> None:
+    """A ring of an even number of nodes and heavy weights on one half: that half is left out of the cover."""
+    n = 40
+    edges = "".join(f"h {i + 1} {(i + 1) % n + 1} 0\n" for i in range(n))
+    Path("ring.wcnf").write_text(edges + "".join(f"{90 + i % 2 * 9} {-i - 1} 0\n" for i in range(n)))
+    outcome = memcomp_solve("problem=ring.wcnf", f"solver={solver}", FAST[2])
+    assert outcome.status == 0, outcome.err
+    assert f"{90 * n // 2}  (minimise)" in outcome.out
 
 
 @pytest.mark.parametrize("solver", ["dmm_recorded", "brute_force", "alternating_descent"])
@@ -185,6 +215,34 @@ def test_every_combination_in_a_multirun(memcomp_solve: Solve) -> None:
     assert len(list(Path("all").glob("*/solution.json"))) == 4
 
 
+def test_a_search_keeps_time_states_and_curve(memcomp_solve: Solve) -> None:
+    pairs = "".join(f"{i} {j} {(7 * i + 3 * j) % 11 - 5}\n" for i in range(1, 31) for j in range(1, i))
+    Path("cut.txt").write_text(f"30 435\n{pairs}")
+    best = ["solver=best", "hydra.run.dir=run"]
+    outcome = memcomp_solve("problem=cut.txt", *best, "n_solutions=4", "min_distance=2")
+    assert outcome.status == 0, outcome.err
+    for part in ("AGREED", "lower bound", "no state has a lower energy", "solutions", "4, energies up to -"):
+        assert part in outcome.out
+    found = json.loads(Path("run/solution.json").read_text())
+    assert found["status"] == "AGREED"
+    assert found["lower_bound"] <= found["energy"] == found["curve"][-1][1]
+    x = np.array([found["assignment"], *(other["assignment"] for other in found["other_solutions"])])
+    assert len(x) == 4
+    assert all((x[i] != x[j]).sum() >= 2 for i in range(4) for j in range(i))
+    energies = [found["energy"], *(other["energy"] for other in found["other_solutions"])]
+    problem = read_problem("cut.txt")
+    assert energies == sorted(energies) == problem.problem.energy(x).tolist()
+    Path("start.txt").write_text("\n".join(map(str, found["assignment"])))
+    for start in ("run/solution.json", "start.txt"):
+        target = f"target={found['objective']['value']}"
+        outcome = memcomp_solve("problem=cut.txt", f"initial={start}", target, best[0], "hydra.run.dir=again")
+        assert outcome.status == 0, outcome.err
+        again = json.loads(Path("again/solution.json").read_text())
+        assert (again["assignment"], again["restarts"]["energy"]) == (found["assignment"], [])
+    outcome = memcomp_solve("problem=cut.txt", *best, "time_limit=0.2", "solver.effort=0.1")
+    assert len(json.loads(Path("run/solution.json").read_text())["restarts"]["energy"]) > 28
+
+
 REFUSED = {
     "": ["problem=FILE is missing", "memcomp-solve problem=G1.txt", "beasley", "--help"],
     "problem=": ["problem=FILE is missing"],
@@ -203,11 +261,16 @@ REFUSED = {
     "problem=ring.txt maximise=1": ["maximise = 1", "true or false"],
     "problem=pairs.wcnf maximise=true": ["maximise = True", "false for a file of format 'wcnf'"],
     "problem=ring.txt seed=1.5": ["seed = 1.5", "an integer"],
+    "problem=ring.txt time_limit=0": ["time_limit = 0", "seconds > 0"],
+    "problem=ring.txt target=far": ["target = 'far'", "a finite number"],
+    "problem=ring.txt n_solutions=0": ["n_solutions = 0"],
+    "problem=ring.txt initial=none.json": ["initial=none.json cannot be read"],
+    "problem=ring.txt initial=ring.txt": ["shape of initial"],
+    "problem=ring.txt initial=rbm.npz": ["initial=rbm.npz holds no state", "zeros and ones"],
     "problem=ring.txt +keep=1": ["setting = 'keep'", "'problem'"],
     "problem=ring.txt model=dbn": ["'model'"],
     "problem=ring.txt hydra.run.dir=/proc/none": ["hydra.run.dir = /proc/none", "no file can be written"],
     "problem=three.txt": ["three.txt, line 1: found '3 1 1'", "format=gset", "format=coo"],
-    "problem=triples.cnf solver=brute_force": ["longest clause = 3", "at most 2 literals"],
     "problem=ring.txt solver.max_steps=1000000000": ["solver.record.every = 8", "at least 33", "solver=dmm"],
     "-m problem=ring.txt,bad.txt": ["bad.txt, line 3", "(job problem=bad.txt)"],
 }

@@ -1,5 +1,6 @@
 """``memcomp-solve``: look for the minimum of a problem that stands in a file."""
 
+import math
 import os
 import sys
 from collections import Counter
@@ -9,11 +10,12 @@ from typing import Any
 import hydra
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli.arguments import read
-from memcomp_lightning.cli.output import make_tolerant, refuse, say
+from memcomp_lightning.cli.output import NOT_FEASIBLE, make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line
 from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.hydra_versions import MAIN
@@ -22,9 +24,9 @@ from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.problems import Problem, ProblemFileError, in_full
 from memcomp_lightning.runs.table import short_path
-from memcomp_lightning.solvers import Answer, QuboSolution, QuboSolver, write_solution
+from memcomp_lightning.solvers import Answer, Found, QuboSolver, Status, write_solution
 from memcomp_lightning.solvers.dmm import Trajectory
-from memcomp_lightning.solvers.solving import memory_needed, minimise
+from memcomp_lightning.solvers.solving import memory_needed
 
 COMMAND = "memcomp-solve"
 
@@ -38,12 +40,16 @@ def solve(config: DictConfig) -> None:
     make_tolerant()  # again: a job of a parallel launcher is in a process of its own
     os.chdir(settings.runtime.cwd)  # paths are meant from there, with hydra.job.chdir=true, too
     try:
-        problem, solver = prepare(config)
+        problem, solver, search, initial = prepare(config)
         say("\n".join([f"{problem.name}: {_headline(problem)}", *_remarks(problem, solver)]))
-        solution = minimise(problem, solver, config.seed)
-        _write(Path(settings.runtime.output_dir), config, problem, solution)
+        found = search.run(problem, solver, seed=config.seed, initial=initial)
+        answer = _write(Path(settings.runtime.output_dir), config, problem, found)
+        if found.interrupted:
+            raise KeyboardInterrupt("The best so far is written.")
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
+    if answer.score.hard_unsatisfied and settings.mode is RunMode.RUN:  # a sweep goes on
+        sys.exit(NOT_FEASIBLE)
 
 
 def _headline(problem: Problem) -> str:
@@ -65,7 +71,7 @@ def _remarks(problem: Problem, solver: QuboSolver) -> list[str]:
     return [f"Note: {remark}" for remark in remarks]
 
 
-def _table(problem: Problem, answer: Answer, wall_time_s: float) -> str:
+def _table(problem: Problem, answer: Answer, found: Found) -> str:
     """The answer as names and values."""
     broken = answer.score.hard_unsatisfied
     rows = [(problem.objective.name, f"{in_full(answer.score.value)}  ({problem.objective.direction})")]
@@ -74,9 +80,15 @@ def _table(problem: Problem, answer: Answer, wall_time_s: float) -> str:
     status = Counter(sorted(answer.status))
     rows += [
         ("energy", f"{in_full(answer.energy)}  (reached by {answer.n_reached} of {answer.n_run} restarts)"),
-        ("wall time", f"{wall_time_s:.2f} s"),
+        ("wall time", f"{found.wall_time_s:.2f} s"),
         *((f"{count} x {ended.name}", ended.advice) for ended, count in status.items()),
     ]
+    if found.conclusion not in status:
+        rows.append((found.conclusion.name, found.conclusion.advice))
+    if math.isfinite(found.lower_bound) and found.conclusion is not Status.OPTIMAL:
+        rows.append(("lower bound", f"{found.lower_bound:.12g}: no state has a lower energy"))
+    if len(found.states) > 1:
+        rows.append(("solutions", f"{len(found.states)}, energies up to {in_full(found.states[-1].energy)}"))
     if 0 < problem.n <= _LONGEST_PRINTED:
         rows.append(("assignment", _bits(answer.assignment)))
     width = max(len(name) for name, _ in rows)
@@ -87,7 +99,7 @@ def _bits(x: NDArray[np.bool_]) -> str:
     return "".join("1" if bit else "0" for bit in x.tolist())
 
 
-def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSolution) -> None:
+def _write(folder: Path, config: DictConfig, problem: Problem, found: Found) -> Answer:
     """Write solution and picture, then print table and paths; the table is printed even if writing fails."""
     solver = OmegaConf.to_container(config.solver, resolve=True)
     assert isinstance(solver, dict)
@@ -95,14 +107,14 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
     file, written, picture, lost = folder / "solution.json", False, None, ""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_solution(file, problem, solution, solver=settings, seed=config.seed)
+        write_solution(file, problem, found, solver=settings, seed=config.seed)
         written = True
-        if isinstance(solution.trajectory, Trajectory):
-            picture = _draw(folder, problem.name, solution.trajectory)
+        if isinstance(found.trajectory, Trajectory):
+            picture = _draw(folder, problem.name, found.trajectory)
     except OSError as error:
         lost = f"folder {folder} cannot be written ({error.strerror}): choose another with hydra.run.dir=PATH"
-    answer = Answer.of(problem, solution)
-    say(f"\n{_table(problem, answer, solution.wall_time_s)}\n")
+    answer = Answer.of(problem, found)
+    say(f"\n{_table(problem, answer, found)}\n")
     holds = "" if problem.n <= _LONGEST_PRINTED else "  (the assignment, among the rest)"
     if written:
         say(f"Solution:    {short_path(file)}{holds}")
@@ -112,6 +124,7 @@ def _write(folder: Path, config: DictConfig, problem: Problem, solution: QuboSol
         say(f"Trajectory:  {short_path(picture)}, .svg")
     if lost:
         raise UserError(lost)
+    return answer
 
 
 def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:
@@ -142,4 +155,4 @@ def main() -> None:
         refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
         rest = "Finished jobs keep their solutions." if "--multirun" in sys.argv else "No solution is written."
-        raise KeyboardInterrupt(rest) from interrupt
+        raise KeyboardInterrupt(str(interrupt) or rest) from interrupt

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from itertools import compress, pairwise
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.arrays import double
+from memcomp_lightning.problems.constrained import Constrained, clause
 from memcomp_lightning.problems.files.numbers import LARGEST_INT64, Exact, Numbers, in_full
 from memcomp_lightning.problems.files.source import Source
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
@@ -71,6 +72,7 @@ class Parsed:
         integers: ``problem`` as integers, in units of its numbers' last digit, for solvers that prove; None where
             int64 does not hold its sums, or for clauses of three literals and more.
         resolved: Whether float64 tells apart all energies that differ.
+        constrained: ``problem`` with its hard clauses apart, for solvers that prove nothing; None without any.
     """
 
     problem: Qubo | WeightedMaxSat
@@ -80,6 +82,7 @@ class Parsed:
     remarks: tuple[str, ...] = ()
     integers: Qubo | None = None
     resolved: bool = True
+    constrained: Constrained | None = None
 
 
 # ------------------------------------------------------------------------------------------ terms of two variables
@@ -101,6 +104,11 @@ class Terms:
     i: NDArray[np.int64]
     j: NDArray[np.int64]
     numbers: Numbers
+
+    @property
+    def unit(self) -> float:
+        """Sums are multiples of it."""
+        return float(10.0**-self.numbers.decimals)
 
     def count(self, x: Bits) -> Score:
         """The sum, without rounding."""
@@ -127,10 +135,10 @@ def from_terms(
     size = 9 * numbers.total  # a pair of spins: 4 x_i x_j - 2 x_i - 2 x_j + 1
     integers = None
     if numbers.integers.dtype != object:  # energies fit: sums on the way that overflow wrap round, and back again
-        integers = _as_qubo(terms, len(used), sign * numbers.integers)
+        integers = sum_as_qubo(terms.kind, len(used), i, j, sign * numbers.integers)
     _check_size(source, numbers.exact(size))
     if integers is None or size > LARGEST_INT64 or numbers.decimals > 22:  # 10^22 is the last that float64 holds
-        problem = _as_qubo(terms, len(used), sign * numbers.double())
+        problem = sum_as_qubo(terms.kind, len(used), i, j, sign * numbers.double())
     else:
         parts = (integers.coupling, integers.linear, integers.offset)
         size = sum(int(abs(part).sum()) for part in parts)
@@ -141,14 +149,20 @@ def from_terms(
     return Parsed(problem, objective, n, used.astype(np.int64), tuple(said), integers, resolved)
 
 
-def _as_qubo(terms: Terms, n: int, values: NDArray[Any]) -> Qubo:
-    """The sum as a QUBO of the same dtype as the values; the last of these is a constant."""
-    i, j, v, constant = terms.i, terms.j, values[:-1], values[-1]
-    if terms.kind == "product":
+def sum_as_qubo(
+    kind: Literal["product", "cut", "spin"],
+    n: int,
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    values: NDArray[Any],
+) -> Qubo:
+    """Such a sum as :class:`Terms` is, as a QUBO of the same dtype as the values; the last of these is added."""
+    v, constant = values[:-1], values[-1]
+    if kind == "product":
         return Qubo.from_coo(n, i, j, v, constant)
     own = i == j
     (a, b, w), (k, h) = (t[~own] for t in (i, j, v)), (t[own] for t in (i, v))
-    if terms.kind == "cut":
+    if kind == "cut":
         return Qubo.from_coo(
             n, np.concatenate((a, a, b)), np.concatenate((b, a, b)), np.concatenate((-2 * w, w, w)), constant
         )
@@ -226,6 +240,11 @@ class ClauseList:
     weight: Numbers
     hard: Bits
 
+    @property
+    def unit(self) -> float:
+        """Sums are multiples of it."""
+        return float(10.0**-self.weight.decimals)
+
     def count(self, x: Bits) -> Score:
         """Weight of the unsatisfied soft clauses, number of the unsatisfied hard ones."""
         true = x[np.abs(self.literals) - 1] == (self.literals > 0)
@@ -266,7 +285,12 @@ def from_clauses(
     listed = ClauseList(flat, np.repeat(np.arange(len(clauses)), lengths), soft, is_hard)
     objective = Objective(name, listed, penalty=soft.exact(penalty))
     resolved = _resolved(size, soft.decimals, len(clauses))
-    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved)
+    constrained = None
+    if any(hard):
+        clauses_, weights_ = list(compress(renamed, ~is_hard)), list(compress(weights, ~is_hard))
+        soft_alone = WeightedMaxSat.from_clauses(len(used), clauses_, weights_)
+        constrained = Constrained.of(soft_alone, [clause(found) for found in compress(renamed, is_hard)])
+    return Parsed(problem, objective, n, used - 1, tuple(said), integers, resolved, constrained)
 
 
 def _penalty(total: int, one: int) -> int:
@@ -292,6 +316,7 @@ class RbmEnergy:
         c: ``(n_hidden,)``.
     """
 
+    unit: ClassVar[None] = None
     weight: NDArray[np.float64]
     b: NDArray[np.float64]
     c: NDArray[np.float64]

@@ -4,12 +4,12 @@ Source: [P] Pei, Di Ventra, arXiv:2102.04557, eqs. for v, X and Y. Constants: do
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from memcomp_lightning.arrays import Array, namespace
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import Graph
-from memcomp_lightning.problems.maxsat import WeightedMaxSat, over_states, to_qubo
+from memcomp_lightning.problems.maxsat import WeightedMaxSat, as_qubo, over_states
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.dmm.integrate import Integrator, Splitting
 from memcomp_lightning.solvers.dmm.scaling import (
@@ -89,6 +89,7 @@ class BondField:
     long_term_max: float = 4.15
     noise: float = 0.79
     spread: float = 1.0
+    takes_long_clauses: ClassVar[bool] = False
     integrator: Integrator = field(default_factory=lambda: Splitting(change=1.0, dt_min=0.183, dt_max=0.183))
 
     def __post_init__(self) -> None:
@@ -103,8 +104,16 @@ class BondField:
         require(0 < self.spread <= 1, "spread", self.spread, "a number in (0, 1]")
 
     def build(self, problem: Qubo | WeightedMaxSat) -> BondMachine:
-        """Write the problem in spins, x = (1 + v) / 2, and divide bonds and fields by their scale."""
-        qubo = to_qubo(problem) if isinstance(problem, WeightedMaxSat) else problem
+        """Write the problem in spins, x = (1 + v) / 2, and divide bonds and fields by their scale.
+
+        Raises:
+            SettingError: The problem has clauses of three literals or more.
+        """
+        if isinstance(problem, WeightedMaxSat):
+            longest = max((block.variables.shape[-1] for block in problem.longer), default=2)
+            remedy = "Solve as_qubo(problem), or the clauses with DmmSolver(field=ClauseField())."
+            require(longest == 2, "longest clause", longest, "at most 2 literals", remedy)
+        qubo = as_qubo(problem)
         n_axes = len(qubo.graph.edge_shape)
         coupling, linear = by_largest(qubo.coupling, qubo.linear, n_axes)
         # The energy is coupling / 4 a bond and linear / 2 + sum of couplings / 4 a field: here times -4.

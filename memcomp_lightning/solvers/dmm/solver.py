@@ -192,6 +192,11 @@ class DmmSolver:
             trajectory=trajectory,
         )
 
+    @property
+    def takes_clauses(self) -> bool:
+        """Whether clauses of any length need not become a QUBO first."""
+        return getattr(self.field, "takes_long_clauses", True)
+
     def _start(
         self, problem: Qubo | WeightedMaxSat, n_restarts: int, before: Run | None, generator: "Generator"
     ) -> Start:

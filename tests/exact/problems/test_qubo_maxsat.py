@@ -358,12 +358,6 @@ def test_longer_clauses_add_to_the_rest(graph, problems):
         close(longer, clauses_by_loop([row for row, _ in rows], [weight for _, weight in rows], states))
 
 
-def test_longer_clauses_are_no_qubo():
-    with pytest.raises(SettingError, match=r"longest clause = 5 .* at most 2 literals.*field=ClauseField"):
-        to_qubo(longer_maxsat(SPARSE))
-    to_qubo(longer_maxsat(SPARSE).without_longer())
-
-
 def test_energy_of_boolean_states():
     maxsat, qubo = longer_maxsat(SPARSE), problem(SPARSE)
     states = binary_states(7, like=maxsat.unit)

@@ -1,4 +1,4 @@
-"""dimod both ways: models, solvers, negative phases, and the DMM under dimod's own tests."""
+"""dimod both ways: models, solvers, negative phases, and our solvers under dimod's own tests."""
 
 import importlib
 import sys
@@ -18,11 +18,11 @@ import memcomp_lightning  # noqa: E402
 from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.enumeration import binary_states  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
-from memcomp_lightning.interop import DmmDimodSampler  # noqa: E402
+from memcomp_lightning.interop import MemcompSampler  # noqa: E402
 from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
 from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noqa: E402
 from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
-from memcomp_lightning.solvers import BruteForce, DimodSolver, Status  # noqa: E402
+from memcomp_lightning.solvers import AlternatingDescent, BruteForce, DimodSolver, Portfolio, Status  # noqa: E402
 from memcomp_lightning.solvers.dmm import DmmSolver  # noqa: E402
 from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
 
@@ -212,38 +212,65 @@ def test_without_dimod_the_error_says_what_to_install(monkeypatch):
         _ = memcomp_lightning.solvers.Dimod
 
 
-# --- the DMM as a sampler of dimod ------------------------------------------------------------------------
+# --- our solvers as a sampler of dimod --------------------------------------------------------------------
 
 
-def test_the_dmm_keeps_the_interface_of_dimod():
-    dimod.testing.assert_sampler_api(DmmDimodSampler())
+def test_our_sampler_keeps_the_interface_of_dimod():
+    dimod.testing.assert_sampler_api(MemcompSampler())
 
 
-@dimod.testing.load_sampler_bqm_tests(DmmDimodSampler)
-class TestDmmDimodSampler(unittest.TestCase):
+@dimod.testing.load_sampler_bqm_tests(MemcompSampler)
+class TestMemcompSampler(unittest.TestCase):
     """dimod's own tests of models of all vartypes and types of numbers."""
 
 
-@pytest.mark.parametrize("vartype", ["BINARY", "SPIN"])
-def test_the_dmm_finds_the_optimum_of_models(vartype):
-    bqm = dimod.generators.gnp_random_bqm(11, 0.6, vartype, random_state=0)
+@dimod.testing.load_sampler_bqm_tests(MemcompSampler(DmmSolver()))
+class TestDmmAsSampler(unittest.TestCase):
+    """The same with the DMM."""
+
+
+def model(vartype, n=14):
+    bqm = dimod.generators.gnp_random_bqm(n, 0.6, vartype, random_state=0)
     bqm.relabel_variables({v: f"x{v}" for v in bqm.variables})
-    answer = DmmDimodSampler().sample(bqm, num_reads=9, seed=3)
+    return bqm
+
+
+@pytest.mark.parametrize("solver", [Portfolio(), DmmSolver()])
+@pytest.mark.parametrize("vartype", ["BINARY", "SPIN"])
+def test_it_finds_the_optimum_of_models(vartype, solver):
+    bqm, sampler = model(vartype), MemcompSampler(solver)
+    answer = sampler.sample(bqm, num_reads=9, seed=3)
     dimod.testing.assert_response_energies(answer, bqm)
     assert answer.first.energy == pytest.approx(dimod.ExactSolver().sample(bqm).first.energy)
-    assert len(answer) == 9
-    again = DmmDimodSampler().sample(bqm, num_reads=9, seed=3)
+    assert answer.record.num_occurrences.sum() == 9
+    assert answer.info["lower_bound"] <= answer.first.energy + 1e-9
+    again = sampler.sample(bqm, num_reads=9, seed=3)
     assert np.array_equal(again.record.sample, answer.record.sample)
 
 
+def test_a_time_limit_is_honoured_and_initial_states_are_improved_on():
+    bqm = model("SPIN", n=40)
+    weak = MemcompSampler(AlternatingDescent(n_restarts=1))
+    best = MemcompSampler().sample(bqm).first
+    assert weak.sample(bqm, time_limit=0.3).first.energy < weak.sample(bqm).first.energy
+    for states in (best.sample, [best.sample, dict.fromkeys(best.sample, 1)], dimod.as_samples(best.sample)):
+        answer = weak.sample(bqm, initial_states=states)
+        assert answer.first.energy == pytest.approx(best.energy)
+        dimod.testing.assert_response_energies(answer, bqm)
+    bits = {label: (value + 1) // 2 for label, value in best.sample.items()}
+    assert weak.sample(bqm, initial_states=bits).first.energy == pytest.approx(best.energy)
+
+
 def test_restarts_that_were_not_run_are_left_out():
-    answer = DmmDimodSampler(DmmSolver(n_restarts=28, patience=4)).sample(dimod.BQM({0: -1.0}, {}, "BINARY"))
+    answer = MemcompSampler(DmmSolver(n_restarts=28, patience=4)).sample(dimod.BQM({0: -1.0}, {}, "BINARY"))
     assert 0 < len(answer) < 28
 
 
 def test_what_is_not_known_is_warned_of_or_refused():
     bqm = dimod.BQM({0: -1.0}, {}, "BINARY")
     with pytest.warns(dimod.exceptions.SamplerUnknownArgWarning):
-        DmmDimodSampler().sample(bqm, annealing_time=20)
+        MemcompSampler().sample(bqm, annealing_time=20)
     with pytest.raises(ValueError, match="BruteForce has no n_restarts"):
-        DmmDimodSampler(BruteForce()).sample(bqm, num_reads=3)
+        MemcompSampler(BruteForce()).sample(bqm, num_reads=3)
+    with pytest.raises(SettingError, match="time_limit = 0"):
+        MemcompSampler().sample(bqm, time_limit=0)

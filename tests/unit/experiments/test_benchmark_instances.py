@@ -15,9 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "solver_bench
 pytest.importorskip("numba")
 from exact import branch_and_bound, highs
 from families import families
-from instances import max_cut, random_max_sat, random_rbm, torus
+from instances import max_cut, random_rbm, torus
 from planted import frustrated_loops
-from quadratise import quadratise
 
 
 @pytest.fixture
@@ -55,15 +54,6 @@ def test_max_cut_counts_the_cut():
 
 def test_torus_has_two_edges_a_node(stream):
     assert torus(4, generator=stream).coupling.shape == (32,)
-
-
-def test_quadratised_three_literal_clauses_keep_the_energy(stream):
-    problem = random_max_sat(5, 8, 3, generator=stream)
-    qubo = quadratise(problem)
-    auxiliary = binary_states(qubo.n - 5, like=qubo.linear)
-    for state in binary_states(5, like=qubo.linear):
-        states = torch.cat((state.expand(len(auxiliary), 5), auxiliary), dim=-1)
-        assert qubo.energy(states).min().item() == pytest.approx(problem.energy(state.unsqueeze(0)).item())
 
 
 @pytest.mark.parametrize("cancelled", [0.0, 1.0])

@@ -687,7 +687,7 @@ def test_restarts_that_were_not_run_and_broken_hard_clauses_in_json(write, tmp_p
     write_solution(tmp_path / "s.json", problem, solution, solver={}, seed=0)
     content = json.loads((tmp_path / "s.json").read_text(), parse_constant=pytest.fail)
     assert content["restarts"]["energy"] == [5.0, 4.0, None]
-    assert content["restarts"]["status"] == ["STEP_BUDGET", "STEP_BUDGET", "NOT_RUN"]
+    assert content["restarts"]["status"] == ["NOT_FEASIBLE", "NOT_FEASIBLE", "NOT_RUN"]
     assert content["objective"]["value"] == 0
     assert content["objective"]["hard_clauses_unsatisfied"] == 1
     assert content["problem"]["n_hard_clauses"] == 1

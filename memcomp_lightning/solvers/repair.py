@@ -1,0 +1,83 @@
+"""Mend broken constraints by flips, then lower the objective by flips that break none."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from memcomp_lightning.arrays import Array, alike, cast, double, to_numpy
+from memcomp_lightning.problems import Qubo, WeightedMaxSat
+from memcomp_lightning.problems.constrained import Constrained, sums_of
+from memcomp_lightning.problems.rows import Integers
+from memcomp_lightning.solvers.compiled import grouped
+
+
+def repair(problem: Constrained, x: Array) -> Array:
+    """Flip variables of each state until no flip is an improvement; never breaks more constraints.
+
+    A flip improves a state if it mends more constraints than it breaks, or brings the sums nearer to their bounds,
+    or lowers the objective, in this order. The cheapest flip of those that mend something comes first. Flips that
+    share no constraint, coupling or clause are done at once.
+
+    Args:
+        problem: One problem, or several.
+        x: States in {0, 1}, ``(*problems, n_states, n)``.
+    """
+    rows, state = problem.constraints, to_numpy(x) > 0.5
+    order, ends = grouped(rows.variables, problem.n)
+    around = _Neighbours(problem)
+    row = rows.row
+    while True:
+        sums = rows.sums(state)
+        change = np.where(state[..., rows.variables], -rows.coefficients, rows.coefficients)
+        before = rows.excess(sums)[..., row]
+        after = rows.excess(sums[..., row] + change, row)
+        broken = sums_of(((after > 0) * 1 - (before > 0))[..., order], ends)
+        excess = sums_of((after - before)[..., order], ends)
+        costs = _costs(problem.objective, x, state)
+        mends = (broken < 0) | ((broken == 0) & (excess < 0))
+        lowers = (broken == 0) & (excess == 0) & (costs < -_LEAST * np.abs(costs).max(initial=0.0))
+        good = mends | lowers
+        if not good.any():
+            return cast(alike(np.ascontiguousarray(state), x), x.dtype)
+        price = np.where(mends, costs / np.maximum(-broken, 1), costs)
+        state = state ^ (good & around.first(np.lexsort((price, ~mends, ~good))))
+
+
+_LEAST = 1e-12
+"""What lowers the objective by less, as a share of the largest change, may be a rounding error."""
+
+
+def _costs(objective: Qubo | WeightedMaxSat, x: Array, state: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """What each flip adds to the objective, ``(*problems, n_states, n)``."""
+    field = to_numpy(double(objective.field(cast(alike(state, x), x.dtype))))
+    return np.where(state, -field, field)
+
+
+class _Neighbours:
+    """Which variables share a constraint, a coupling or a clause."""
+
+    def __init__(self, problem: Constrained) -> None:
+        rows, objective = problem.constraints, problem.objective
+        parts = [(rows.variables, rows.lengths)]
+        blocks = [to_numpy(objective.graph.edges())]
+        if isinstance(objective, WeightedMaxSat):
+            blocks += [to_numpy(block.variables) for block in objective.longer]
+        parts += [(block.ravel(), np.full(len(block), block.shape[1])) for block in blocks]
+        lengths = np.concatenate([part[1] for part in parts])
+        self._variables = np.concatenate([part[0] for part in parts])
+        self._group = np.repeat(np.arange(np.count_nonzero(lengths)), lengths[lengths > 0])
+        self._begins = np.flatnonzero(np.diff(self._group, prepend=-1))
+        self._order, ends = grouped(self._variables, problem.n)
+        self._used = np.flatnonzero(np.diff(ends))
+        self._ends = ends[self._used]
+
+    def first(self, order: Integers) -> NDArray[np.bool_]:
+        """Variables that come before all their neighbours in an order, ``(*leading, n)``."""
+        place = np.empty_like(order)
+        np.put_along_axis(place, order, np.arange(order.shape[-1]), -1)
+        earliest = np.ones(place.shape, np.bool_)
+        if len(self._begins):
+            lowest = np.minimum.reduceat(place[..., self._variables], self._begins, axis=-1)
+            lowest = lowest[..., self._group[self._order]]
+            lowest = np.minimum.reduceat(lowest, self._ends, axis=-1)
+            earliest[..., self._used] = lowest == place[..., self._used]
+        return earliest

@@ -1,0 +1,202 @@
+"""Constraints by solvers that know none: against enumeration, and what a repair may not do."""
+
+import random
+
+import numpy as np
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.arrays import to_numpy
+from memcomp_lightning.enumeration import binary_states
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.problems import Constrained, Linear, Qubo, WeightedMaxSat, clause, exactly
+from memcomp_lightning.solvers import (
+    AlternatingDescent,
+    BruteForce,
+    GibbsAnnealing,
+    PenaltyLoop,
+    Portfolio,
+    Status,
+    TabuSearch,
+)
+from memcomp_lightning.solvers.dmm import BondField, DmmSolver
+from memcomp_lightning.solvers.repair import repair
+
+SOLVERS = {
+    "brute force": BruteForce(),
+    "descent": AlternatingDescent(n_restarts=40),
+    "annealing": GibbsAnnealing(n_restarts=20, n_sweeps=60),
+    "tabu": TabuSearch(n_restarts=12, n_steps=300),
+    "best": Portfolio(n_restarts=16),
+    "clauses": DmmSolver(n_restarts=20),
+    "bonds": DmmSolver(field=BondField(), n_restarts=20),
+}
+LIKE = {"numpy": np.zeros(0), "torch": torch.zeros(0)}
+N = 7
+
+
+def random_problem(seed, *, problems=()):
+    """Clauses, exactly k and linear bounds over seven variables, in turn alone and together."""
+    draw = random.Random(seed)
+    rows, kinds = [], ["clause", "exactly", "linear"]
+    kind = [*kinds, None][seed % 4]
+    for _ in range(draw.randint(1, 5)):
+        chosen = draw.sample(range(N), draw.randint(1, 4))
+        this = kind or draw.choice(kinds)
+        if this == "clause":
+            rows.append(clause(draw.choice([-1, 1]) * (i + 1) for i in chosen))
+        elif this == "exactly":
+            rows.append(exactly(draw.randint(0, min(2, len(chosen))), chosen))
+        else:
+            a = {i: draw.choice([-2, -1, 1, 2]) for i in chosen}
+            rows.append(Linear(a, *draw.choice([(0, 1), (None, 1), (0, None), (1, 1)])))
+    if seed % 3 == 0 and not problems:
+        clauses = [[draw.choice([-1, 1]) * i for i in draw.sample(range(1, N + 1), k)] for k in (1, 1, 2, 2, 3, 4)]
+        objective = WeightedMaxSat.from_clauses(N, clauses, [draw.randint(1, 9) for _ in clauses])
+    else:
+        entries = np.random.default_rng(seed).integers(-5, 6, (*problems, N, N))
+        objective = Qubo.from_matrix(entries.astype(np.float64))
+    return Constrained.of(objective, rows)
+
+
+def ranks(problem):
+    """Broken constraints and objective of every state, ``(*problems, 2^N)`` each."""
+    states = binary_states(N, like=np.zeros(0))
+    states = np.broadcast_to(states, (*problem.objective.problems, *states.shape))
+    return problem.n_broken(states), problem.energy(states)
+
+
+@pytest.mark.parametrize("like", LIKE)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_answer_is_the_best_of_those_that_keep_all_constraints(name, like):
+    n_exact = 0
+    for seed in range(24):
+        problem = random_problem(seed)
+        broken, energies = ranks(problem)
+        given = Constrained(problem.objective.alike(LIKE[like]), problem.constraints)
+        solution = PenaltyLoop(solver=SOLVERS[name]).minimise(given, generator=rng.numpy_stream(seed, "solver"))
+        assert type(solution.assignments) is type(LIKE[like])
+        assert solution.broken.tolist() == problem.n_broken(to_numpy(solution.assignments)).tolist()
+        np.testing.assert_allclose(to_numpy(solution.energies), problem.energy(to_numpy(solution.assignments)))
+        fewest = int(problem.n_broken(to_numpy(solution.best)[None])[0])
+        assert fewest == int(solution.broken.min())
+        assert (fewest == 0) == (broken.min() == 0), f"seed {seed}: there is a state that keeps all constraints"
+        status = set(solution.status.tolist())
+        if broken.min() > 0:
+            assert status <= {Status.NOT_FEASIBLE, Status.INFEASIBLE}
+            assert name != "brute force" or Status.INFEASIBLE in status
+            continue
+        lowest = energies[broken == 0].min()
+        n_exact += float(solution.best_energy) == pytest.approx(lowest)
+        if Status.OPTIMAL in status:
+            proven = to_numpy(solution.energies)[to_numpy(solution.status) == int(Status.OPTIMAL)]
+            assert proven.min() == pytest.approx(lowest)
+            assert Status.INFEASIBLE not in status
+        assert name != "brute force" or Status.OPTIMAL in status
+    n_feasible = sum(ranks(random_problem(seed))[0].min() == 0 for seed in range(24))
+    assert 12 < n_feasible < 24
+    assert n_exact == n_feasible if name == "brute force" else n_exact >= n_feasible - 1
+
+
+@pytest.mark.parametrize("like", LIKE)
+def test_a_repair_breaks_nothing_and_ends_where_no_flip_helps(like):
+    for seed in range(40):
+        problem = random_problem(seed)
+        given = Constrained(problem.objective.alike(LIKE[like]), problem.constraints)
+        states = binary_states(N, like=given.objective.offset)
+        found = repair(given, states)
+        assert type(found) is type(states)
+        before, after = given.n_broken(states).tolist(), given.n_broken(found).tolist()
+        assert all(b <= a for a, b in zip(before, after, strict=True))
+        kept = to_numpy(given.n_broken(states)) == 0
+        assert (to_numpy(given.energy(found))[kept] <= to_numpy(given.energy(states))[kept] + 1e-9).all()
+        assert repair(given, found).tolist() == found.tolist()
+        for i in range(N):
+            flipped = to_numpy(found).copy()
+            flipped[:, i] = 1 - flipped[:, i]
+            of_flipped, of_found = problem.n_broken(flipped), problem.n_broken(to_numpy(found))
+            assert (of_flipped >= of_found).all()
+            cheaper = problem.energy(flipped) < problem.energy(to_numpy(found)) - 1e-6
+            assert not (cheaper & (of_found == 0) & (of_flipped == 0)).any()
+
+
+def test_what_shares_nothing_is_mended_in_one_pass(monkeypatch):
+    """A thousand broken pairs, side by side: as many steps as one."""
+    rows = [exactly(1, [2 * k, 2 * k + 1]) for k in range(1000)]
+    diagonal = np.arange(2000)
+    problem = Constrained.of(Qubo.from_coo(2000, diagonal, diagonal, np.tile([1.0, 2.0], 1000)), rows)
+    passes = []
+    sums = type(problem.constraints).sums
+    monkeypatch.setattr(type(problem.constraints), "sums", lambda *given: passes.append(0) or sums(*given))
+    found = repair(problem, np.zeros((3, 2000)))
+    assert found.tolist() == [[1.0, 0.0] * 1000] * 3, "the cheaper one of each pair"
+    assert len(passes) == 2
+
+
+@pytest.mark.parametrize("solver", ["annealing", "tabu", "best", "clauses"])
+def test_a_batch_of_objectives(solver):
+    for seed in range(1, 9):
+        problem = random_problem(seed, problems=(2, 3))
+        broken, energies = ranks(problem)
+        solution = PenaltyLoop(solver=SOLVERS[solver]).minimise(
+            problem, generator=rng.numpy_stream(seed, "solver")
+        )
+        assert solution.best.shape == (2, 3, N)
+        assert solution.broken.shape == solution.energies.shape
+        if broken.min() == 0:
+            lowest = np.where(broken == 0, energies, np.inf).min(-1)
+            np.testing.assert_allclose(solution.best_energy, lowest)
+
+
+def test_penalties_rise_until_breaking_does_not_pay():
+    """Each flip is cheap to undo alone, but the two constraints bar the way: the first penalties are too low."""
+    clauses = [[i] for i in range(1, 7)]
+    objective = WeightedMaxSat.from_clauses(7, clauses, [1.0] * 6)
+    rows = [clause([-i, 7]) for i in range(1, 7)] + [clause([-7])]
+    seen = []
+
+    class Watched:
+        def minimise(self, qubo, *, generator):
+            seen.append(float(abs(qubo.linear).max()))
+            return BruteForce().minimise(qubo, generator=generator)
+
+    problem = Constrained.of(objective, rows)
+    solution = PenaltyLoop(solver=Watched()).minimise(problem, generator=rng.numpy_stream(0, "solver"))
+    assert len(seen) > 1
+    assert sorted(seen) == seen
+    assert float(solution.best_energy) == 6
+    assert solution.status.tolist()[-1] == Status.OPTIMAL
+
+
+def test_the_best_answer_breaks_the_fewest_whatever_its_energy():
+    from memcomp_lightning.solvers import QuboSolution
+
+    energies = np.array([[-9.0, 3.0, 2.0, -8.0], [0.0, 1.0, 2.0, -1.0]])
+    assignments = np.broadcast_to(np.arange(4.0)[:, None], (2, 4, 1))
+    broken = np.array([[2, 0, 0, 1], [3, 2, 2, 3]])
+    solution = QuboSolution(assignments, energies, broken, broken, 0.0, broken=broken)
+    assert solution.best_energy.tolist() == [2.0, 1.0]
+    assert solution.best.tolist() == [[2.0], [1.0]]
+
+
+def test_no_constraints_and_long_clauses():
+    """Clauses of three literals and more have auxiliary variables, which are no part of the answer."""
+    draw = random.Random(0)
+    clauses = [[draw.choice([-1, 1]) * i for i in draw.sample(range(1, 8), k)] for k in [3, 4, 5, 6, 7] * 6]
+    maxsat = WeightedMaxSat.from_clauses(N, clauses, [draw.randint(1, 9) for _ in clauses])
+    lowest = maxsat.energy(binary_states(N, like=np.zeros(0))).min()
+    for name in ("annealing", "tabu", "best", "bonds"):
+        loop = PenaltyLoop(solver=SOLVERS[name])
+        solution = loop.minimise(Constrained.of(maxsat, []), generator=rng.numpy_stream(0, "solver"))
+        assert solution.assignments.shape[-1] == N
+        assert float(solution.best_energy) == lowest
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"solver": 3}, "a solver, which has minimise"), ({"solver": BruteForce(), "n_rounds": 0}, "n_rounds = 0")],
+)
+def test_refusals(settings, message):
+    with pytest.raises(SettingError, match=message):
+        PenaltyLoop(**settings)
