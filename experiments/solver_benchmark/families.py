@@ -178,6 +178,6 @@ def families(cache: Path) -> list[Family]:
     ]
     if os.environ.get("MEMCOMP_DATA_DIR"):
         chosen += [_trained(training, cache, **at_horizon) for training in large_trainings]
-        chosen += [_files("G-set", 2.0), _files("Beasley", 2.0)]
+        chosen += [_files("G-set", 1.0), _files("Beasley", 1.0)]
     groups = list(dict.fromkeys(family.group for family in chosen))
     return sorted(chosen, key=lambda family: (groups.index(family.group), family.n))
