@@ -23,6 +23,7 @@ SOLVERS = {
     "best": "best.Portfolio",
     "annealing": "annealing.GibbsAnnealing",
     "tabu": "tabu.TabuSearch",
+    "crossover": "crossover.CrossoverAnnealing",
     "dmm": "dmm.DmmSolver",
     "alternating_descent": "alternating_descent.AlternatingDescent",
     "brute_force": "brute_force.BruteForce",
