@@ -1,4 +1,4 @@
-"""What one ground state of a Boltzmann machine's QUBO costs: the DMM against dwave-samplers' simulated annealing.
+"""What one ground state of a Boltzmann machine's QUBO costs: solver=best and the DMM beside dwave-samplers' annealing.
 
 python experiments/joint_pretraining/solvers.py               # a DBM, a Zephyr graph, a full machine; minutes
 """
@@ -17,6 +17,7 @@ from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.models import DBM, BoltzmannMachine, Gaussian
 from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers.ground_state import problem_of
+from memcomp_lightning.solvers import Portfolio, QuboSolver
 from memcomp_lightning.solvers.dmm import DmmSolver
 
 STD = 0.3
@@ -41,8 +42,8 @@ def annealed(qubo: Qubo, reads: int, sweeps: int, seed: int) -> tuple[float, flo
     return float(found.first.energy), time.perf_counter() - begin
 
 
-def by_dmm(qubo: Qubo, solver: DmmSolver, seed: int) -> tuple[float, float]:
-    """Lowest energy by the DMM, and the seconds."""
+def found_by(solver: QuboSolver, qubo: Qubo, seed: int) -> tuple[float, float]:
+    """Lowest energy by a solver of the package, and the seconds."""
     begin = time.perf_counter()
     found = solver.minimise(qubo, generator=rng.stream(seed, "solver"))
     return float(found.best_energy), time.perf_counter() - begin
@@ -51,14 +52,14 @@ def by_dmm(qubo: Qubo, solver: DmmSolver, seed: int) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--instances", type=int, default=5)
-    parser.add_argument("--reads", type=int, default=28, help="of annealing, as many as the DMM has restarts")
+    parser.add_argument("--reads", type=int, default=28, help="of annealing, as many as the others have restarts")
     parser.add_argument("--sweeps", type=int, default=100, help="of annealing")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    print("| machine | couplings | DMM, ms | SA, ms | gap of the DMM to the better | gap of SA |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print("| machine | couplings | best, ms | DMM, ms | SA, ms | gap of best | gap of the DMM | gap of SA |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, make in MACHINES.items():
-        found: dict[str, list[tuple[float, float]]] = {"dmm": [], "sa": []}
+        found: list[list[tuple[float, float]]] = []
         for instance in range(given.instances + 1):
             generator = rng.stream(instance, "machine")
             model = make(generator)
@@ -66,15 +67,15 @@ def main() -> None:
                 for bias in (model.b, model.c):
                     bias.normal_(0.0, STD, generator=generator)
             qubo, _ = problem_of(model)
-            runs = (by_dmm(qubo, DmmSolver(), instance), annealed(qubo, given.reads, given.sweeps, instance))
+            runs = [found_by(solver, qubo, instance) for solver in (Portfolio(), DmmSolver())]
+            runs.append(annealed(qubo, given.reads, given.sweeps, instance))
             if instance:  # the first one loads what is compiled
-                found["dmm"].append(runs[0])
-                found["sa"].append(runs[1])
-        best = [min(pair[0][0], pair[1][0]) for pair in zip(found["dmm"], found["sa"], strict=True)]
+                found.append(runs)
+        lowest = [min(energy for energy, _ in runs) for runs in found]
         cells = [str(len(model.pairs))]
-        cells += [f"{1e3 * statistics.median(seconds for _, seconds in found[who]):.1f}" for who in ("dmm", "sa")]
-        for who in ("dmm", "sa"):
-            gaps = [(energy - low) / abs(low) for (energy, _), low in zip(found[who], best, strict=True)]
+        cells += [f"{1e3 * statistics.median(runs[k][1] for runs in found):.1f}" for k in range(3)]
+        for k in range(3):
+            gaps = [(runs[k][0] - low) / abs(low) for runs, low in zip(found, lowest, strict=True)]
             cells.append(f"{statistics.median(gaps):.2%} (worst {max(gaps):.2%})")
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
