@@ -1,4 +1,4 @@
-"""What one ground state of a Boltzmann machine's QUBO costs: solver=best and the DMM beside dwave-samplers' annealing.
+"""What one ground state of a machine costs: solver=best and the DMM beside dwave-samplers' annealing.
 
 python experiments/joint_pretraining/solvers.py               # a DBM, a Zephyr graph, a full machine; minutes
 """
