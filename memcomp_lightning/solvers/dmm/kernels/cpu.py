@@ -293,8 +293,8 @@ def _blocks(n_restarts: int) -> tuple[int, int]:
     return -(-n_restarts // lanes_each), lanes_each
 
 
-_VECTOR = 8
-"""float32 numbers in a vector register; layers are padded to a multiple."""
+_VECTOR = 16
+"""float32 numbers in the widest vector registers; layers are padded to a multiple."""
 
 
 def _to_lanes(x: Numbers, n_blocks: int, lanes_each: int) -> Numbers:

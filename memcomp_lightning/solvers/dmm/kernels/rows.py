@@ -4,8 +4,8 @@ One call integrates one restart, so that its memories stay in the cache and rest
 arrays are float32; the variables are (first layer, second layer), matrices are (n_second, n_first). The
 equations are those of ``ClauseField`` and ``BondField``, the scheme is ``Splitting``.
 
-Matrices are passed flat and read at unsigned offsets: views of their rows would be counted references, which cost
-more than the arithmetic of a short row.
+Matrices are passed flat and read at unsigned offsets: a signed one could count from the end, which prevents vector
+code.
 """
 
 import math
