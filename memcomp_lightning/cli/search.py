@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from importlib.metadata import version
 
 from hydra import compose
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -79,6 +78,8 @@ def _check_storage(storage: object) -> None:
     """Refuse what would end in an AssertionError inside optuna."""
     if storage is None:
         return
+    from importlib.metadata import version  # which few commands need
+
     optuna, sqlalchemy = version("optuna"), version("sqlalchemy")
     if int(optuna.partition(".")[0]) < 3 and int(sqlalchemy.partition(".")[0]) >= 2:
         raise UserError(
