@@ -157,7 +157,8 @@ def test_a_picture_that_cannot_be_written_costs_the_picture_alone(
 
     Path("edge.txt").write_text(EDGE)
     monkeypatch.setattr(plotting, "plot_trajectory", full)
-    outcome = memcomp_solve("problem=edge.txt", "solver.max_steps=40", "hydra.run.dir=run")
+    recorded = ["solver=dmm_recorded", "solver.max_steps=40"]
+    outcome = memcomp_solve("problem=edge.txt", *recorded, "hydra.run.dir=run")
     assert outcome.status == 2
     assert Path("run/solution.json").exists()
     assert "Solution:    run/solution.json" in outcome.out
@@ -206,6 +207,8 @@ def test_commands_start_before_anything_heavy_is_imported() -> None:
         "_functools",
         "_operator",
         "itertools",
+        "atexit",
+        "gc",
     }
 
 
