@@ -16,7 +16,7 @@ _spent: list[float] = []
 
 
 def seconds_spent() -> float:
-    """Seconds that numba has compiled in this process since :func:`announce_compilation`."""
+    """Seconds that numba has compiled or loaded in this process since :func:`announce_compilation`."""
     return sum(_spent)
 
 
@@ -47,6 +47,11 @@ def announce_compilation() -> None:
             if package == __package__:
                 _log_once(_PARTS.get(name.partition(".")[0], "the solver's kernels"))
 
+        def on_end(self, event: Any) -> None:
+            pass
+
+    class Clock(event.Listener):
+        def on_start(self, event: Any) -> None:
             if not _begun:
                 _spent.append(0.0)
             _begun.append(time.perf_counter())
@@ -57,6 +62,7 @@ def announce_compilation() -> None:
                 _spent[-1] = time.perf_counter() - begin
 
     event.register("numba:compile", Announcement())  # type: ignore[no-untyped-call]
+    event.register("numba:compiler_lock", Clock())  # type: ignore[no-untyped-call]
 
 
 @contextmanager

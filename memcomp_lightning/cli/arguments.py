@@ -50,6 +50,7 @@ class CommandLine:
         shows: The flag that shows something in place of a run, with its value; none in a run.
         config_dir: A folder of configurations, absolute.
         package: The part of the configuration that is shown, None for all of it.
+        problems: Files, folders and patterns as typed, of a command that takes them, in a run.
         claimed: The folder that was made for this command, None before that or where the arguments name one.
     """
 
@@ -58,6 +59,7 @@ class CommandLine:
     shows: tuple[str, ...]
     config_dir: Path | None
     package: str | None
+    problems: tuple[str, ...] = ()
     claimed: Path | None = None
 
     @property
@@ -73,8 +75,11 @@ class CommandLine:
         return unquoted(texts[-1]) if texts else None
 
 
-def read(arguments: Sequence[str]) -> CommandLine:
+def read(arguments: Sequence[str], *, takes_problems: bool = False) -> CommandLine:
     """Read a command line.
+
+    A command that takes problems has them among its settings or as ``problem=``; without ``--multirun`` they are
+    kept as typed, and settings may have several values all the same.
 
     Raises:
         UserError: Naming the argument, and how to write it.
@@ -102,14 +107,24 @@ def read(arguments: Sequence[str]) -> CommandLine:
         raise UserError("--resolve is for what --cfg and --help show: add --cfg job.")
     shows = [*map(_flag, shown), *(value for value in (given.cfg, given.info) if value is not None)]
     shows += ["--resolve"] if given.resolve else []
-    overrides = given.overrides
+    overrides, problems = given.overrides, list[str]()
     if given.shell_completion:
         _check_completion(overrides)
     else:
         _check_blanks(overrides)
-        overrides = [_readable(override, multirun=multirun) for override in overrides]
+        if takes_problems := takes_problems and not (multirun or shows):
+            problems = [o.removeprefix("problem=") for o in overrides if _names_problem(o)]
+            overrides = [o for o in overrides if not _names_problem(o)]
+        overrides = [_readable(override, multirun=multirun or takes_problems) for override in overrides]
     folder = None if given.config_dir is None else Path(expanded("--config-dir", given.config_dir)).absolute()
-    return CommandLine(tuple(overrides), multirun, tuple(shows), folder, given.package)
+    return CommandLine(tuple(overrides), multirun, tuple(shows), folder, given.package, tuple(problems))
+
+
+def _names_problem(argument: str) -> bool:
+    """Whether an argument is a problem: given by name, or without, as a file is."""
+    name, equals, _ = argument.partition("=")
+    plain = not equals and argument[:1] not in ("", "+", "~")
+    return plain or name == "problem" or argument.startswith("~/") or is_file(argument)
 
 
 def _flag(name: str) -> str:
@@ -118,7 +133,7 @@ def _flag(name: str) -> str:
 
 def unquoted(text: str) -> str:
     """A value as Hydra reads it, where that is a text; else as it stands."""
-    value = _value(text)
+    value = hydra_value(text)
     return value if isinstance(value, str) else text
 
 
@@ -127,7 +142,7 @@ def from_folder(override: str, folder: Path) -> str:
     name, _, text = override.partition("=")
     if folder == Path.cwd() or not is_path(name) or name.startswith("~"):
         return override
-    value = _value(text)
+    value = hydra_value(text)
     if not isinstance(value, str) or not value or value.startswith(("/", "~", "${")):
         return override
     return with_path(name, folder / value)
@@ -148,7 +163,7 @@ def _readable(override: str, *, multirun: bool) -> str:
     if not equals:
         if name.startswith("~"):
             parse(name)
-        elif _is_file(override):
+        elif is_file(override):
             raise UserError(f"{override} is no setting: expected NAME=VALUE. Did you mean problem={override}?")
         else:
             raise UserError(f"{override or 'An empty argument'} is no setting: expected NAME=VALUE.")
@@ -158,7 +173,7 @@ def _readable(override: str, *, multirun: bool) -> str:
     if name == _SEARCH_PATH:
         return _absolute_search_path(override)
     if is_path(name) and not name.startswith("~"):
-        swept = multirun and name not in _NEVER_SWEPT and not _is_file(text)
+        swept = multirun and name not in _NEVER_SWEPT and not is_file(text)
         return _path(name, text, swept=swept)
     text = text.strip()
     readable = f"{name}={'null' if text == 'None' else text}"
@@ -181,14 +196,14 @@ def _path(name: str, text: str, *, swept: bool) -> str:
     """A path, in quotes where Hydra needs them, so that a file may have any name."""
     if not text.strip(" '\"") and name != "problem":
         raise UserError(f"{name}={text} names no path: write {name}=PATH")
-    text = "null" if text.strip() == "None" and not _is_file(text) else text
-    value = _value(text)
-    if value is None or (isinstance(value, bool | list | dict) and not _is_file(text)):
+    text = "null" if text.strip() == "None" and not is_file(text) else text
+    value = hydra_value(text)
+    if value is None or (isinstance(value, bool | list | dict) and not is_file(text)):
         return f"{name}={text}"
     if isinstance(value, str) and value != text:  # in quotes already
         return with_path(name, expanded(name, value)) if value.startswith("~") else f"{name}={text.strip()}"
     if isinstance(value, Glob) and not Path(text).exists():
-        files = _files(value)
+        files = matching(value)
         if not files:
             raise UserError(f"{name}={text} matches no file in {Path.cwd()}.")
         if len(files) > 1 and not swept:
@@ -213,7 +228,7 @@ def with_path(name: str, path: Path | str) -> str:
 
 
 def _quoted(text: str) -> str:
-    if _value(text) == text:
+    if hydra_value(text) == text:
         return text
     escaped = re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\\'", text))
     return f"'{escaped}'"
@@ -222,7 +237,7 @@ def _quoted(text: str) -> str:
 _UNREADABLE = object()
 
 
-def _value(text: str) -> object:
+def hydra_value(text: str) -> object:
     """The value that Hydra reads; ``_UNREADABLE``, which equals no value, where it cannot read the text."""
     try:
         return OverridesParser.create().parse_override(f"x={text}").value()
@@ -242,7 +257,8 @@ def expanded(name: str, text: str) -> str:
         ) from None
 
 
-def _files(pattern: Glob) -> list[str]:
+def matching(pattern: Glob) -> list[str]:
+    """The files that a ``glob(...)`` stands for."""
     found = sorted({file for included in pattern.include for file in glob.glob(included, recursive=True)})  # noqa: PTH207
     excluded = pattern.exclude
     return [file for file in found if Path(file).is_file() and not any(fnmatch(file, name) for name in excluded)]
@@ -258,7 +274,7 @@ def _absolute_search_path(override: str) -> str:
     return f"{_SEARCH_PATH}=[{','.join(map(_quoted, places))}]"
 
 
-_is_file = os.path.isfile
+is_file = os.path.isfile
 """Unlike the method of a path, it raises for no name: one that is too long, or has a zero in it."""
 
 

@@ -21,6 +21,11 @@ _OF_SEARCH = ("time_limit", "target", "n_solutions", "min_distance")
 
 _SETTINGS = ("problem", "format", "maximise", "seed", "solver", "initial", *_OF_SEARCH)
 
+PROBLEM_MISSING = (
+    "problem=FILE is missing: name the file of a problem, as in memcomp-solve problem=G1.txt. Formats: "
+    f"{', '.join(FORMATS)}; memcomp-solve --help describes them."
+)
+
 
 class Prepared(NamedTuple):
     """What a command line asks for.
@@ -45,24 +50,31 @@ def prepare(config: DictConfig) -> Prepared:
         UserError, SettingError, ProblemFileError, InstantiationException: A setting does not exist or is out of
             range, or the file cannot be read.
     """
-    for name in config:
-        require_choice("setting", name, _SETTINGS)
-    check_values(config)
-    require(isinstance(config.maximise, bool), "maximise", config.maximise, "true or false")
+    solver = checked_solver(config)
     if not config.problem:
-        raise UserError(
-            "problem=FILE is missing: name the file of a problem, as in memcomp-solve problem=G1.txt. Formats: "
-            f"{', '.join(FORMATS)}; memcomp-solve --help describes them."
-        )
-    solver: QuboSolver = instantiate(config.solver)
+        raise UserError(PROBLEM_MISSING)
     problem = _read(str(config.problem), config.format, config.maximise)
     check_memory(problem, solver)
     search = {name: config[name] for name in _OF_SEARCH}
     if search["target"] is not None:
-        Search(target=search["target"])
         search["target"] = problem.objective.energy(Score(search["target"]))
     initial = None if config.initial is None else Labelled(problem=problem).read(_state(str(config.initial)))
     return Prepared(problem, solver, Search(**search), initial)
+
+
+def checked_solver(config: DictConfig) -> QuboSolver:
+    """Build the solver, and check what is set besides, but for the problem.
+
+    Raises:
+        SettingError, InstantiationException: A setting does not exist or is out of range.
+    """
+    for name in config:
+        require_choice("setting", name, _SETTINGS)
+    check_values(config)
+    require(isinstance(config.maximise, bool), "maximise", config.maximise, "true or false")
+    Search(**{name: config[name] for name in _OF_SEARCH})
+    solver: QuboSolver = instantiate(config.solver)
+    return solver
 
 
 @lru_cache(maxsize=1)

@@ -9,7 +9,7 @@ from memcomp_lightning.problems.files.source import ProblemFileError
 from memcomp_lightning.problems.from_model import from_model
 from memcomp_lightning.problems.graph import Bipartite, EdgeList, Graph
 from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, as_qubo, from_qubo, to_qubo
-from memcomp_lightning.problems.problem import Problem, read_problem
+from memcomp_lightning.problems.problem import Problem, is_problem_file, read_problem
 from memcomp_lightning.problems.qubo import Qubo
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "from_model",
     "from_qubo",
     "in_full",
+    "is_problem_file",
     "read_problem",
     "to_qubo",
 ]

@@ -92,6 +92,22 @@ def read_problem(path: str | Path, format: str | None = None, *, maximise: bool 
     return Problem(path=path, format=name, **{part.name: getattr(parsed, part.name) for part in fields(parsed)})
 
 
+def is_problem_file(path: Path) -> bool:
+    """Whether a file of a folder is a problem, by its suffix; of ``.txt`` and without one, by its first lines.
+
+    What may be one of several formats, or is damaged, counts as one: :func:`read_problem` says what is wrong.
+    """
+    if path.name.startswith(".") or not path.is_file():
+        return False
+    suffix = stem(path).suffix.lower()
+    if suffix not in ("", ".txt"):
+        return any(suffix in row.suffixes for row in FORMATS.values())
+    try:
+        return guess(Source(path, _read(path))) is not None
+    except ProblemFileError:
+        return True
+
+
 def _read(path: Path) -> bytes:
     """The uncompressed bytes of a file."""
     try:

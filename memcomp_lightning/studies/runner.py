@@ -1,22 +1,18 @@
 """Trials one after the other or in several processes; each record is written as soon as it exists."""
 
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
-from multiprocessing.connection import Client, Connection, Listener
 from typing import Protocol
 
 import torch
-from joblib import Parallel, delayed
-from joblib.externals.loky import get_reusable_executor
 from tqdm import tqdm
 
 from memcomp_lightning.compiling import told
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.processes import processes, say
 from memcomp_lightning.studies.accuracy import Progress, device_of
 from memcomp_lightning.studies.records import Record, Records
 
@@ -67,21 +63,8 @@ def runner(name: str, *, workers: int | None = 1, accelerator: str = "cpu") -> I
         if workers == 1:
             yield partial(run, lambda work: (one.run(show) for one in work))
             return
-        key = os.urandom(16)
-        with Listener(authkey=key) as listener:
-            threading.Thread(target=_listen, args=(listener, show), daemon=True).start()
-            parallel = Parallel(
-                workers,
-                batch_size=1,
-                max_nbytes=None,
-                return_as="generator_unordered",
-                initializer=_begin_worker,
-                initargs=(listener.address, key),
-            )
-            try:
-                yield partial(run, lambda work: parallel(delayed(_run_in_worker)(one) for one in work))
-            finally:
-                get_reusable_executor().shutdown(wait=True, kill_workers=True)
+        with processes(workers, show) as do:
+            yield partial(run, partial(do, _run_in_worker))
 
 
 def _n_cores() -> int:
@@ -89,44 +72,9 @@ def _n_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _listen(listener: Listener, progress: Progress) -> None:
-    """Take what workers say, each in a thread of its own, until the listener is closed."""
-    with suppress(OSError):
-        while True:
-            threading.Thread(target=_pass_on, args=(listener.accept(), progress), daemon=True).start()
-
-
-def _pass_on(connection: Connection, progress: Progress) -> None:
-    with suppress(EOFError, OSError):  # the worker has ended
-        while True:
-            progress(*connection.recv())
-
-
-_first: Connection | None = None
-"""In a worker, the line to the first process."""
-
-
-def _begin_worker(address: str | tuple[str, int], key: bytes) -> None:
-    global _first
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends the others
-    _first = Client(address, authkey=key)
-    threading.Thread(target=_end_with, args=(_first,), daemon=True).start()
-    torch.set_num_threads(1)
-
-
-def _end_with(first: Connection) -> None:
-    """End this worker when the connection ends: a first process that is killed cannot end its workers."""
-    with suppress(EOFError, OSError):
-        first.recv()
-    os._exit(1)
-
-
 def _run_in_worker(work: Work) -> list[Record]:
+    torch.set_num_threads(1)
     last, waiting = time.monotonic(), 0
-
-    def say(what: str, n_updates: int) -> None:
-        if _first is not None:
-            _first.send((what, n_updates))
 
     def report(what: str, n_updates: int) -> None:
         nonlocal last, waiting

@@ -250,8 +250,8 @@ REFUSED = {
     "problem=bad.txt": ["bad.txt, line 3: found '1 4 1', expected two vertices, integers from 1 to 3."],
     "problem=rign.txt": ["rign.txt: there is no such file. Near it: ring.txt"],
     "problem=a=b,c.txt": ["a=b,c.txt: there is no such file."],
-    "problem=.": ["cannot be read"],
-    "ring.txt": ["ring.txt is no setting", "Did you mean problem=ring.txt?"],
+    "problem=[]": ["problem=FILE is missing"],
+    "-m ring.txt": ["ring.txt is no setting", "Did you mean problem=ring.txt?"],
     "problm=ring.txt": ["problm=ring.txt", "does not exist", "Did you mean problem?"],
     "problem=ring.txt solver.n_restart=3": ["solver.n_restart=3", "Did you mean solver.n_restarts?"],
     "problem=ring.txt solver=dmn": ["Did you mean solver=dmm?", "brute_force, dimod, dmm"],
@@ -300,7 +300,13 @@ def test_a_problem_too_large_for_the_solver_ends_in_one_line(memcomp_solve: Solv
 def test_help_has_examples_every_format_and_every_solver(memcomp_solve: Solve) -> None:
     outcome = memcomp_solve("--help")
     assert outcome.status == 0
-    for part in ("memcomp-solve problem=G1.txt", "maximise: false", "beasley  .sparse", "p wcnf n m top"):
+    for part in (
+        "memcomp-solve G1.txt",
+        "--output FILE.csv",
+        "maximise: false",
+        "beasley  .sparse",
+        "p wcnf n m top",
+    ):
         assert part in outcome.out
     for name, row in FORMATS.items():
         assert f"\n  {name.ljust(8)} " in outcome.out

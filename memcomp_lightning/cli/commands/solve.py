@@ -4,6 +4,7 @@ import math
 import os
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ from hydra.types import RunMode
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.cli.arguments import read
+from memcomp_lightning.cli import batch
+from memcomp_lightning.cli.arguments import read, with_path
 from memcomp_lightning.cli.output import NOT_FEASIBLE, make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line
+from memcomp_lightning.cli.problem_files import problem_files
 from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.hydra_versions import MAIN
 from memcomp_lightning.configuration.problems import prepare
@@ -142,8 +145,14 @@ def _draw(folder: Path, title: str, trajectory: Trajectory) -> Path:
 def main() -> None:
     """Check everything, solve, and end with a table or a message."""
     try:
+        options, arguments = batch.taken(sys.argv[1:])
+        line = read(arguments, takes_problems=True)
+        problems = problem_files(line.problems)
+        if batch.is_many(line, problems, options):
+            sys.exit(batch.solve_many(line, problems, options, command=COMMAND))
+        line = replace(line, overrides=(*line.overrides, *(with_path("problem", file) for file in problems)))
         line = check_command_line(
-            read(sys.argv[1:]),
+            line,
             config_name="solve",
             check=lambda config, _: prepare(config),
             folders=("solve", "solve"),
@@ -151,7 +160,7 @@ def main() -> None:
         sys.argv[1:] = line.arguments
         with answering(line):
             solve()
-    except UserError as error:
+    except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
         rest = "Finished jobs keep their solutions." if "--multirun" in sys.argv else "No solution is written."
