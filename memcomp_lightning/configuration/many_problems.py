@@ -91,7 +91,7 @@ def seen_from(table: Path, file: Path) -> str:
 
 @contextmanager
 def answers(tasks: Sequence[Task], workers: int, heard: Callable[[str], object]) -> Iterator[Iterator[Row]]:
-    """Yield the rows of tasks, as they come: from this process, or from several whose remarks are ``heard`` here."""
+    """Yield the rows of tasks, as they come, from one process or several, whose remarks are ``heard`` here."""
     if workers == 1 or len(tasks) < 2:
         yield map(_solved, tasks)
         return

@@ -23,7 +23,9 @@ def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -
     """Total weight of unsatisfied clauses against machine time (Manukian et al. 2019, Fig. 2).
 
     The restarts follow one another on the time axis, so that each one begins with a spike. The large panel shows
-    the last few of them, the inset all, with a box around what the large panel shows.
+    the last few of them, the inset all, with a box around what the large panel shows. The line of the best ends at
+    the solver's answer: it counts what descents from copies of the machine's state find, too, a restart's best
+    from where it was found.
 
     Args:
         trajectory: Of one problem, ``(n_restarts, n_records)``; records of no dwell (not run) are left out.
@@ -37,9 +39,9 @@ def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -
     shape = tuple(trajectory.time.shape)
     remedy = "Take one: Trajectory(*(field[index] for field in trajectory))."
     require(len(shape) == 2, "trajectory's shape", shape, "(n_restarts, n_records), one problem", remedy)
-    time, weight, starts = _one_after_another(trajectory)
+    time, weight, found, starts = _one_after_another(trajectory)
     require(time.size > 0, "trajectory", f"of shape {shape}", "at least one record of dwell > 0")
-    best = np.minimum.accumulate(weight)
+    best = np.minimum.accumulate(np.minimum(weight, found))
     n_restarts = len(starts) - 1
     shown = max(n_restarts - last, 0)
     begin, end = float(starts[shown]), float(starts[-1])
@@ -65,7 +67,7 @@ def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -
         inset = axes.inset_axes((0.4, _CURVES + 0.06, 0.6, 0.92 - _CURVES))
         _draw(inset, time, weight, best, linewidth=0.5)
         inset.set_xlim(*_margins(0.0, end, share=0.02))
-        inset.set_ylim(*_margins(float(weight.min()), float(weight.max()), share=0.12))
+        inset.set_ylim(*_margins(float(best[-1]), float(weight.max()), share=0.12))
         inset.tick_params(labelsize="x-small", length=2)
         inset.set_title(f"all {n_restarts} restarts", fontsize="x-small", pad=2)
         box = Rectangle((begin, low), end - begin, high - low)
@@ -74,18 +76,21 @@ def plot_trajectory(trajectory: Trajectory, *, last: int = 3, title: str = "") -
     return figure
 
 
-def _one_after_another(trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
-    """Times and weights ``(n_records,)`` of all restarts on one axis; where each begins, and the last one ends."""
-    time, weight, dwell = map(to_numpy, (trajectory.time, trajectory.unsatisfied_weight, trajectory.dwell))
+def _one_after_another(trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+    """Times, weights and found weights ``(n_records,)`` of all restarts; where each begins, and the last ends."""
+    fields = (trajectory.time, trajectory.unsatisfied_weight, trajectory.found_weight, trajectory.dwell)
+    time, weight, found, dwell = map(to_numpy, fields)
     made = dwell > 0
     was_run = made.any(1)
-    time, weight, made = time[was_run], weight[was_run], made[was_run]
+    time, weight, found, made = time[was_run], weight[was_run], found[was_run], made[was_run]
     starts = np.concatenate(([0.0], np.cumsum((time * made).max(1, initial=0.0))))
-    return (time + starts[:-1, None])[made], weight[made], starts
+    return (time + starts[:-1, None])[made], weight[made], found[made], starts
 
 
 def _draw(axes: Axes, time: Floats, weight: Floats, best: Floats, *, linewidth: float) -> None:
-    (line,) = axes.plot(time, best, color=_BEST, linewidth=1.3 * linewidth, linestyle="--", label="best so far")
+    (line,) = axes.plot(
+        time, best, color=_BEST, linewidth=1.3 * linewidth, linestyle="--", label="best so far, with descents"
+    )
     line.set_drawstyle("steps-post")
     axes.plot(time, weight, color=_PATH, linewidth=linewidth, label="machine")
 

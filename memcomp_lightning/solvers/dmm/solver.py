@@ -157,7 +157,7 @@ class DmmSolver:
             start = self._start(part, group.stop - group.start, before, generator)
             run = self._run(part, start, n_steps)
             energies = part.energy(run.best)
-            visited = run.visited and _trajectory(part, run.visited.time, run.visited.states)
+            visited = self.record and run.visited and _trajectory(part, run, energies, self.record.every)
             parts.append(_Part(active, group, run, energies, visited))
             if group.stop == self.n_restarts:
                 break
@@ -318,8 +318,13 @@ def _select(problem: Qubo | WeightedMaxSat, chosen: Array) -> Qubo | WeightedMax
     return _map(problem, lambda x: x[chosen])
 
 
-def _trajectory(problem: Qubo | WeightedMaxSat, times: Array, states: Array) -> Trajectory:
-    """Add what the records weigh, from their states in float64, and how long each one stands."""
+def _trajectory(problem: Qubo | WeightedMaxSat, run: Run, lowest: Array, every: int) -> Trajectory:
+    """Add what the records and the best assignments weigh, in float64, and how long each record stands.
+
+    ``lowest`` are the energies of the best assignments; ``every`` is the number of steps between records.
+    """
+    assert run.visited is not None
+    times, states = run.visited
     n_problems, n_restarts = times.shape[:2]
     n_terms = math.prod(problem.graph.edge_shape) + problem.n
     if isinstance(problem, WeightedMaxSat):
@@ -333,7 +338,10 @@ def _trajectory(problem: Qubo | WeightedMaxSat, times: Array, states: Array) -> 
         parts.append(energies.reshape(part.shape[:-1]))
     offset = from_qubo(problem).offset if isinstance(problem, Qubo) else double(problem.offset)
     dwell = xp.concat((times[..., :1], times[..., 1:] - times[..., :-1]), axis=-1)
-    return Trajectory(times, xp.concat(parts, axis=-1) - offset[:, None, None], states, dwell)
+    steps = every * xp.arange(1, times.shape[-1] + 1, device=times.device)
+    last = steps == every * times.shape[-1]  # what is found after it counts there
+    found = xp.where((run.found_at[..., None] <= steps) | last, (lowest - offset[:, None])[..., None], xp.inf)
+    return Trajectory(times, xp.concat(parts, axis=-1) - offset[:, None, None], states, dwell, found)
 
 
 _MOST_TERMS = 2**22

@@ -13,12 +13,15 @@ class Trajectory(NamedTuple):
         unsatisfied_weight: Total weight of unsatisfied clauses then, same shape.
         assignments: The digital state then, ``(*problems, n_restarts, n_records, n)``, bool.
         dwell: Machine time since the record before, its weight in a time average, same shape as ``time``.
+        found_weight: Total weight of unsatisfied clauses of the restart's best assignment, which a descent from a
+            copy may have found; infinite until it was found. Same shape as ``time``.
     """
 
     time: Array
     unsatisfied_weight: Array
     assignments: Array
     dwell: Array
+    found_weight: Array
 
     def weights(self) -> Array:
         """Of a time average that leaves out the start: ``dwell``, but 0 until the weight falls to its median."""

@@ -10,18 +10,20 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.plotting import plot_trajectory
-from memcomp_lightning.problems import Qubo
+from memcomp_lightning.problems import Qubo, from_qubo
 from memcomp_lightning.solvers.dmm import DmmSolver, Recording, Trajectory
 
 
-def trajectory_of(weight, dwell=None):
+def trajectory_of(weight, dwell=None, found=None):
     """A record each unit of time."""
     weight = torch.tensor(weight, dtype=torch.float64)
+    found = torch.full_like(weight, torch.inf) if found is None else torch.tensor(found, dtype=torch.float64)
     dwell = torch.ones_like(weight) if dwell is None else torch.tensor(dwell, dtype=torch.float64)
     assignments = torch.zeros(*weight.shape, 4, dtype=torch.bool)
-    return Trajectory(dwell.cumsum(-1) * (dwell > 0), weight, assignments, dwell)
+    return Trajectory(dwell.cumsum(-1) * (dwell > 0), weight, assignments, dwell, found)
 
 
+BEST = "best so far, with descents"
 FIVE = trajectory_of([[9, 5, 4], [8, 6, 5], [7, 3, 3], [9, 8, 7], [6, 2, 4]])
 
 
@@ -31,10 +33,33 @@ def lines(axes):
 
 def test_restarts_follow_one_another_and_the_best_never_rises():
     (axes,) = plot_trajectory(FIVE, last=5).axes
-    machine, best = lines(axes)["machine"], lines(axes)["best so far"]
+    machine, best = lines(axes)["machine"], lines(axes)[BEST]
     assert machine[:, 0].tolist() == list(range(1, 16))
     assert machine[:, 1].tolist() == [9, 5, 4, 8, 6, 5, 7, 3, 3, 9, 8, 7, 6, 2, 4]
     assert best[:, 1].tolist() == [9, 5, 4, 4, 4, 4, 4, 3, 3, 3, 3, 3, 3, 2, 2]
+
+
+def test_the_best_counts_what_descents_have_found():
+    inf = float("inf")
+    (axes,) = plot_trajectory(trajectory_of([[9, 5, 4], [8, 6, 5]], found=[[inf, 3, 3], [inf, inf, 2]])).axes
+    drawn = lines(axes)
+    assert drawn["machine"][:, 1].tolist() == [9, 5, 4, 8, 6, 5]
+    assert drawn[BEST][:, 1].tolist() == [9, 3, 3, 3, 3, 2]
+    low, _ = axes.get_ylim()
+    assert low < 2
+
+
+@pytest.mark.parametrize("kernel", ["compiled", "reference"])
+@pytest.mark.parametrize("patience", [None, 2])
+@pytest.mark.parametrize("every", [1, 7, 40])
+def test_the_best_ends_at_the_solvers_answer(kernel, patience, every):
+    qubo = Qubo.from_matrix(np.random.default_rng(0).normal(size=(40, 40)))
+    solver = DmmSolver(n_restarts=4, patience=patience, max_steps=40, record=Recording(every=every), kernel=kernel)
+    solution = solver.minimise(qubo, generator=np.random.default_rng(1))
+    (axes,) = plot_trajectory(solution.trajectory, last=4).axes
+    best = lines(axes)[BEST][:, 1]
+    assert best[-1] + from_qubo(qubo).offset == pytest.approx(solution.best_energy, rel=1e-12)
+    assert (lines(axes)["machine"][:, 1] >= best - 1e-9).all()
 
 
 def test_main_panel_has_the_last_restarts_and_the_inset_all_with_a_box_around_them():
@@ -42,7 +67,7 @@ def test_main_panel_has_the_last_restarts_and_the_inset_all_with_a_box_around_th
     (axes,) = figure.axes
     (inset,) = axes.child_axes
     assert lines(axes)["machine"][:, 0].tolist() == list(range(7, 16))
-    assert lines(axes)["best so far"][0, 1] == 4, "the best of the restarts before counts"
+    assert lines(axes)[BEST][0, 1] == 4, "the best of the restarts before counts"
     assert len(lines(inset)["machine"]) == 15
     (box,) = inset.patches
     assert (box.get_x(), box.get_x() + box.get_width()) == (6, 15)
