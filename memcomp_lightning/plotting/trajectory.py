@@ -89,7 +89,7 @@ def _one_after_another(trajectory: Trajectory) -> tuple[Floats, Floats, Floats, 
 
 def _draw(axes: Axes, time: Floats, weight: Floats, best: Floats, *, linewidth: float) -> None:
     (line,) = axes.plot(
-        time, best, color=_BEST, linewidth=1.3 * linewidth, linestyle="--", label="best so far, with descents"
+        time, best, color=_BEST, linewidth=1.3 * linewidth, linestyle="--", label="best so far,\nwith descents"
     )
     line.set_drawstyle("steps-post")
     axes.plot(time, weight, color=_PATH, linewidth=linewidth, label="machine")

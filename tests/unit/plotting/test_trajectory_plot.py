@@ -23,7 +23,7 @@ def trajectory_of(weight, dwell=None, found=None):
     return Trajectory(dwell.cumsum(-1) * (dwell > 0), weight, assignments, dwell, found)
 
 
-BEST = "best so far, with descents"
+BEST = "best so far,\nwith descents"
 FIVE = trajectory_of([[9, 5, 4], [8, 6, 5], [7, 3, 3], [9, 8, 7], [6, 2, 4]])
 
 
