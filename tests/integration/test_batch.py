@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+import shlex
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -242,3 +244,20 @@ def test_ctrl_c_keeps_finished_rows(tmp_path: Path, workers: int) -> None:
     assert "Traceback" not in err
     assert rows(str(tmp_path / "results.csv"))[0]["problem"] == "b"
     assert not list(tmp_path.rglob("*.partial"))
+
+
+PAGE = (Path(__file__).parents[2] / "docs/solve.md").read_text()
+COMMANDS = [shlex.split(line, comments=True) for line in re.findall(r"^memcomp-solve .*$", PAGE, re.MULTILINE)]
+
+
+def test_commands_of_the_page_run_in_their_order(memcomp_solve: Solve) -> None:
+    (listed,) = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
+    Path("three.coo").write_text(listed)
+    Path("batch/three.coo").write_text(f"# vartype=SPIN\n{listed}")
+    assert len(COMMANDS) == 6
+    outcomes = [memcomp_solve(*arguments) for _, *arguments in COMMANDS]
+    assert [outcome.status for outcome in outcomes] == [0] * 6, [outcome.err for outcome in outcomes]
+    assert re.search(r"energy +-7 .*assignment +101", outcomes[0].out, re.DOTALL)
+    assert "4 of 16 answers" in outcomes[4].out
+    assert rows()[-1]["problem"] == "three"
+    assert Path("gap.png").exists()
