@@ -166,9 +166,9 @@ def summary(rows: Sequence[Row]) -> str:
                 f"{sum(seconds) / len(seconds):.2f} s" if seconds else "",
             ]
         )
-    others = sum(not row["best_known"] for row in rows)
+    others = sum(is_answer(row) and not row["best_known"] for row in rows)
     against = "the best of this table" if not known else "best known values"
-    rest = f", of {others} answers to the best of this table" if known and others else ""
+    rest = f", {others} of them to the best of this table" if known and others else ""
     return f"{table.for_screen(screen)}\nGaps are to {against}{rest}."
 
 

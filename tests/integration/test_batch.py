@@ -152,7 +152,7 @@ def test_gaps_to_values_beside_the_problems(memcomp_solve: Solve) -> None:
     assert outcome.status == 0, outcome.err
     found = {row["problem"]: (row["best_known"], row["gap"]) for row in rows()}
     assert found == {"ring": ("5", "0.2"), "b": ("-8.0", "-0.25"), "pairs": ("", "0")}
-    assert "Gaps are to best known values, of 1 answers to the best of this table." in outcome.out
+    assert "Gaps are to best known values, 1 of them to the best of this table." in outcome.out
     Path("mine.csv").write_text("name,value\nring,8\n")
     again = memcomp_solve("batch", "--output", "results.csv", "best_known=mine.csv")
     assert "3 of 3 answers" in again.out
