@@ -109,7 +109,9 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
     todo = [task for task in tasks if not task.is_done(rows)]
     if len(todo) < len(tasks):
         say(f"{len(tasks) - len(todo)} of {len(tasks)} answers are in {short_path(table.absolute())} already.")
-    order = list(dict.fromkeys([*rows, *(solve_table.key(task.row) for task in tasks)]))
+    of_tasks = [task.row for task in tasks]
+    label = dict(zip(map(solve_table.key, of_tasks), solve_table.labels(of_tasks), strict=True))
+    order = list(dict.fromkeys([*rows, *label]))
     values = {seen_from(table, file): value for file, value in known.items()}
 
     def written() -> list[Row]:
@@ -124,7 +126,7 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
             for number, row in enumerate(coming, start=1):
                 rows[solve_table.key(row)] = row
                 written()
-                say(f"[{number}/{len(todo)}]  {_in_a_line(row)}")
+                say(f"[{number}/{len(todo)}]  {_in_a_line(row, label[solve_table.key(row)])}")
         found = written()  # once more: other values may be known than when the rows were made
         say(f"\n{solve_table.summary(found)}\n\nTable:      {short_path(table.absolute())}")
         say(f"Solutions:  {short_path(folder.absolute())}")
@@ -136,7 +138,7 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
     except OSError as error:
         place = f"{error.filename or table} cannot be written ({error.strerror})"
         raise UserError(f"{place}: choose another file with --output FILE.") from error
-    own = [rows[solve_table.key(task.row)] for task in tasks]
+    own = [rows[key] for key in label]
     return 1 if any(row["error"] for row in own) else 0 if all(map(solve_table.is_answer, own)) else NOT_FEASIBLE
 
 
@@ -147,21 +149,20 @@ def _checked(line: CommandLine, options: Options) -> tuple[list[Combination], Pa
     def check(config: DictConfig, job: Sequence[str]) -> None:
         combinations.append(Combination.of(config, job))
 
-    given = line.value("hydra.sweep.dir")
-    folder = None if options.output is None else options.output.with_suffix("")
-    own = [] if folder is None else [with_path("hydra.sweep.dir", folder)]
+    given, table = line.value("hydra.sweep.dir"), options.output
+    own = [] if table is None else [with_path("hydra.sweep.dir", table.parent)]
     many = replace(line, multirun=True, overrides=(*line.overrides, *own))
     try:
         made = check_command_line(many, config_name="solve", check=check, folders=("solve", "solve")).claimed
     except UserError as error:
         raise UserError(str(error).replace("hydra.sweep.dir", "--output") if own else str(error)) from error
-    folder = folder or (made or Path(given or "solve")) / "results"
-    return combinations, folder.with_name(f"{folder.name}.csv"), folder
+    table = table or (made or Path(given or "solve")) / "results.csv"
+    return combinations, table, table.with_name(f"{table.stem}_solutions")
 
 
-def _in_a_line(row: Row) -> str:
+def _in_a_line(row: Row, label: str) -> str:
     """A row as it is told when it comes."""
-    who = f"{row['problem']}  {solve_table.name_of(row)}  seed={row['seed']}"
+    who = f"{row['problem']}  {label}  seed={row['seed']}"
     if row["error"]:
         return f"{who}:  refused. {row['error']}"
     broken = "" if solve_table.is_answer(row) else f", {row['hard_unsatisfied']} hard clauses broken"

@@ -113,7 +113,9 @@ def curves(
     """Seconds and gap of the answers by solver, on the way where their solutions in ``folder`` tell it."""
     compared = references(rows, known)
     found: dict[str, list[Curve]] = {}
-    for row in filter(is_answer, rows):
+    for row, name in zip(rows, labels(rows), strict=True):
+        if not is_answer(row):
+            continue
         try:
             told = json.loads((folder / row["solution"]).read_text(encoding="utf-8")).get("curve", [])
         except (OSError, ValueError):
@@ -121,7 +123,7 @@ def curves(
         sign, reference = -1 if row["direction"] == "maximise" else 1, compared[row["file"]]
         on_the_way = [(seconds, gap(row, sign * Fraction(energy), reference)) for seconds, energy in told]
         end = float(row["wall_time_s"]), gap(row, Fraction(row["value"]), reference)
-        found.setdefault(name_of(row), []).append([*on_the_way, end])
+        found.setdefault(name, []).append([*on_the_way, end])
     return found
 
 
@@ -139,9 +141,10 @@ def gap(row: Row, value: Fraction, reference: Fraction) -> float:
 # ------------------------------------------------------------------------------------------------------ for people
 
 
-def name_of(row: Row) -> str:
-    """The solver of a row, with its settings."""
-    return f"{row['solver']} {row['settings']}".rstrip()
+def labels(rows: Sequence[Row]) -> list[str]:
+    """The solver of each row, with its settings where these are not the same in all rows."""
+    differ = len({row["settings"] for row in rows}) > 1
+    return [f"{row['solver']} {row['settings']}".rstrip() if differ else row["solver"] for row in rows]
 
 
 def summary(rows: Sequence[Row]) -> str:
@@ -149,8 +152,9 @@ def summary(rows: Sequence[Row]) -> str:
     known = any(row["best_known"] for row in rows)
     title = ["solver", "answers", "mean gap", "largest gap", "at best known" if known else "at best", "better"]
     screen = [[*title, "proven", "hard clauses broken", "refused", "mean time"]]
-    for name in dict.fromkeys(map(name_of, rows)):
-        own = [row for row in rows if name_of(row) == name]
+    names = labels(rows)
+    for name in dict.fromkeys(names):
+        own = [row for row, of in zip(rows, names, strict=True) if of == name]
         solved = [row for row in own if not row["error"]]
         gaps = [float(row["gap"]) for row in own if is_answer(row)]
         proven = sum(row["status"] == "OPTIMAL" for row in solved)

@@ -105,7 +105,7 @@ def test_without_a_name_the_table_is_in_a_folder_named_by_the_time(memcomp_solve
     assert memcomp_solve("batch").status == 0
     (table,) = Path("solve").glob("*/results.csv")
     assert len(rows(str(table))) == 3
-    assert len(list(table.parent.glob("results/*.json"))) == 3
+    assert len(list(table.parent.glob("results_solutions/*.json"))) == 3
 
 
 def test_what_is_done_is_not_done_again(memcomp_solve: Solve) -> None:
@@ -244,6 +244,8 @@ def test_ctrl_c_keeps_finished_rows(tmp_path: Path, workers: int) -> None:
     assert "Traceback" not in err
     assert rows(str(tmp_path / "results.csv"))[0]["problem"] == "b"
     assert not list(tmp_path.rglob("*.partial"))
+    out, _ = launch(*arguments, "solver.max_steps=50", *slow[1:], folder=tmp_path, command="solve").communicate()
+    assert re.match(r"[12] of 3 answers are in results.csv already.\n\[1/[12]\]", out)
 
 
 PAGE = (Path(__file__).parents[2] / "docs/solve.md").read_text()

@@ -92,6 +92,7 @@ def test_curves_end_at_the_answer_and_begin_where_the_solution_says(tmp_path):
     rows = [
         row(file="g.txt", value="8", direction="maximise", solution="cut.json"),
         row(file="a.coo", solution="lost.json"),
+        row(file="a.coo", error="too large"),
     ]
     curves = solve_table.curves(rows, {"g.txt": "10"}, tmp_path)
     assert curves == {"best": [[(0.1, 0.5), (0.2, 0.2), (0.5, 0.2)], [(0.5, 0.0)]]}
