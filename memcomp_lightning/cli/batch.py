@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli.arguments import CommandLine, parse, with_path
+from memcomp_lightning.cli.arguments import CommandLine, expanded, parse, with_path
 from memcomp_lightning.cli.output import NOT_FEASIBLE, say
 from memcomp_lightning.cli.overrides import check_command_line
 from memcomp_lightning.configuration.many_problems import Combination, answers, best_known, seen_from, tasks_of
@@ -71,7 +71,7 @@ def taken(arguments: Sequence[str]) -> tuple[Options, list[str]]:
         if not text or (not equals and text.startswith("--")):
             raise UserError(f"{name} has no value: write {name}{'=' if equals else ' '}VALUE.")
         number = option == "workers" and re.fullmatch(r"-?\d+", text)
-        given[option] = int(text) if number else text if option == "workers" else Path(text).expanduser()
+        given[option] = int(text) if number else text if option == "workers" else Path(expanded(name, text))
     return Options(**given), others
 
 

@@ -19,7 +19,14 @@ from scipy.io import mmread
 from memcomp_lightning import __version__, rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import RBM
-from memcomp_lightning.problems import FORMATS, ProblemFileError, Qubo, WeightedMaxSat, read_problem
+from memcomp_lightning.problems import (
+    FORMATS,
+    ProblemFileError,
+    Qubo,
+    WeightedMaxSat,
+    is_problem_file,
+    read_problem,
+)
 from memcomp_lightning.solvers import Answer, BruteForce, QuboSolution, Status, write_solution
 
 DATA = Path(os.environ.get("MEMCOMP_DATA_DIR", "")) / "qubo"
@@ -701,6 +708,25 @@ def test_solution_of_several_problems_is_refused(write, tmp_path):
     )
     with pytest.raises(SettingError, match=r"\(1, 2\) is not allowed: expected \(n_restarts,\)"):
         write_solution(tmp_path / "s.json", problem, several, solver={}, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "is_one"),
+    [
+        ("a.coo", b"anything", True),
+        ("a.WCNF.gz", b"anything", True),
+        ("a.csv", b"2 1\n1 2 1\n", False),
+        ("a.txt", b"2 1\n1 2 1\n", True),
+        ("G1", b"2 1\n1 2 1\n", True),
+        ("Makefile", b"all:\n\ttrue\n", False),
+        ("three.txt", b"3 1 1\n1 2 1\n", True),  # of several formats: who reads it is told so
+        (".hidden.coo", b"0 1 2\n", False),
+    ],
+)
+def test_which_files_of_a_folder_are_problems(tmp_path, name, data, is_one):
+    (tmp_path / name).write_bytes(data)
+    assert is_problem_file(tmp_path / name) is is_one
+    assert not is_problem_file(tmp_path)
 
 
 # ------------------------------------------------------------------------------------------------ real files
