@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, add_up, alike, cast, double, namespace, to_numpy
@@ -168,6 +166,9 @@ def _cross(qubo: Qubo, x: Array, other: Array) -> Array:
 
 def _parts(pairs: np.ndarray, differs: np.ndarray) -> np.ndarray:
     """Number of the connected component of each variable among those that differ, of each state."""
+    from scipy.sparse import coo_array  # the compiled kernel does without, and starts sooner
+    from scipy.sparse.csgraph import connected_components
+
     both = differs[..., pairs[:, 0]] & differs[..., pairs[:, 1]]
     n, states = differs.shape[-1], both.reshape(math.prod(both.shape[:-1]), -1).nonzero()
     ends = (states[0] * n + pairs[states[1], end] for end in (0, 1))

@@ -254,7 +254,7 @@ REFUSED = {
     "-m ring.txt": ["ring.txt is no setting", "Did you mean problem=ring.txt?"],
     "problm=ring.txt": ["problm=ring.txt", "does not exist", "Did you mean problem?"],
     "problem=ring.txt solver.n_restart=3": ["solver.n_restart=3", "Did you mean solver.n_restarts?"],
-    "problem=ring.txt solver=dmn": ["Did you mean solver=dmm?", "brute_force, dimod, dmm"],
+    "problem=ring.txt solver=dmn": ["Did you mean solver=dmm?", "brute_force, crossover, dimod, dmm"],
     "problem=ring.txt solver=dmm solver.max_steps=0": ["max_steps = 0", "an integer >= 1"],
     "problem=ring.txt solver=dmm solver.field.alpha=nan": ["solver.field.alpha = nan", "a finite number"],
     "problem=ring.txt format=gest": ["format = 'gest'", "'gset'"],
