@@ -333,19 +333,28 @@ def test_problems_in_numpy_are_solved_without_torch():
     assert lowest < 0
 
 
-HEAVY = {"torch", "lightning", "sklearn", "joblib", "tqdm", "pandas", "matplotlib", "dimod"}
+HEAVY = {"torch", "lightning", "sklearn", "joblib", "tqdm", "pandas", "matplotlib"}
 
 
 @pytest.mark.parametrize(
-    ("n", "besides"), [(3, {"scipy", "numba"}), (30, set())], ids=["enumerated", "compiled kernels"]
+    ("arguments", "n", "besides"),
+    [
+        (["problem=path.txt"], 3, {"scipy", "numba", "dimod"}),
+        (["problem=path.txt", "solver=annealing"], 30, set()),
+        (["path.txt", "solver=annealing", "seed=0,1", "--output", "table.csv"], 30, set()),
+    ],
+    ids=["enumerated", "compiled kernels", "a table"],
 )
-def test_the_command_imports_what_it_needs(tmp_path, n, besides):
+def test_the_command_imports_what_it_needs(tmp_path, arguments, n, besides):
     (tmp_path / "path.txt").write_text(f"{n} {n - 1}\n" + "".join(f"{i} {i + 1} 1\n" for i in range(1, n)))
     program = f"""
 import sys
 from memcomp_lightning.cli.solve import main
-sys.argv[1:] = ["problem=path.txt"]
-main()
+sys.argv[1:] = {arguments}
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
 print(*({HEAVY | besides} & sys.modules.keys()), file=sys.stderr)
 """
     done = subprocess.run(
