@@ -25,11 +25,13 @@ class PenaltyLoop:
     """Solve problems with constraints by a solver that knows none.
 
     A round gives the solver the objective plus a penalty for each broken constraint, and mends its answers
-    (:func:`~memcomp_lightning.solvers.repair.repair`). Penalties begin at what breaking the constraint can gain
-    (:func:`local_penalties`): a larger one hides the objective. Where an answer with broken constraints has less
-    energy than the best without, these constraints cost too little: their penalties double, and the next round
-    begins. Where no round found an answer that keeps all constraints, the last one takes penalties with which
-    breaking one never pays; so it does for a solver that proves its minima.
+    (:func:`~memcomp_lightning.solvers.repair.repair`). Penalties begin at what breaking the constraint may gain
+    (:func:`local_penalties`): larger ones hide the objective. Where an answer with broken constraints has less
+    energy than the best without, these constraints cost too little: their penalties double, in the second half of
+    the rounds all penalties, and the next round begins. Where none has after the first round, but its best answer
+    would gain far less by breaking constraints (:func:`gains`), there is a second one with smaller penalties.
+    Where no answer keeps all constraints, the last round takes penalties with which breaking one never pays; so it
+    does for a solver that proves its minima.
 
     Attributes:
         solver: The solver.
@@ -37,7 +39,7 @@ class PenaltyLoop:
     """
 
     solver: QuboSolver
-    n_rounds: int = 6
+    n_rounds: int = 8
 
     def __post_init__(self) -> None:
         require_parts("solver", self.solver, "solver", ("minimise",))
@@ -66,9 +68,14 @@ class PenaltyLoop:
             # Less energy than the best answer that keeps all constraints: to break some pays.
             pays = to_numpy(solution.energies) < lowest[..., None] - _LEAST * safe
             too_cheap = (broken & pays[..., None]).any(-2) & (penalties < safe)
-            if not too_cheap.any():
+            enough = np.clip(gains(problem, found[-1].best), penalties / 4, penalties)
+            if too_cheap.any():
+                dearer = too_cheap | (k >= self.n_rounds // 2)
+                penalties = np.where(dearer, np.minimum(2 * penalties, safe), penalties)
+            elif k == 0 and kept.all() and enough.sum() < penalties.sum() / 2:
+                penalties = enough
+            else:
                 break
-            penalties = np.where(too_cheap, np.minimum(2 * penalties, safe), penalties)
             if k == self.n_rounds - 2:
                 proves = to_numpy(solution.status == int(Status.OPTIMAL)).all(-1)
                 penalties = np.where((np.isinf(lowest) | proves)[..., None], safe, penalties)
@@ -140,6 +147,24 @@ def local_penalties(problem: Constrained) -> Numbers:
         cheapest = np.minimum.reduceat(np.where(sums_rise, *costs), rows.begins[:-1][filled], axis=-1)
         penalties[..., of_rows] = np.maximum(penalties[..., of_rows], cheapest[..., of_rows[filled]])
     return np.minimum(np.where(penalties > 0, penalties, extra), safe_penalty(problem))
+
+
+def gains(problem: Constrained, x: Array) -> Numbers:
+    """How far a flip that breaks each constraint lowers the objective at most, ``(*problems, n_constraints)``.
+
+    Args:
+        problem: The problem.
+        x: A state that keeps all constraints, ``(*problems, n)``.
+    """
+    rows, state = problem.constraints, to_numpy(x) > 0.5
+    field = to_numpy(double(problem.objective.field(x[..., None, :])))[..., 0, :]
+    gain = np.where(state, field, -field).clip(min=0)[..., rows.variables]
+    change = np.where(state[..., rows.variables], -rows.coefficients, rows.coefficients)
+    breaks = rows.excess(rows.sums(state)[..., rows.row] + change, rows.row) > 0
+    found, filled = np.zeros((*problem.objective.problems, len(rows))), rows.lengths > 0
+    begins = rows.begins[:-1][filled]
+    found[..., filled] = np.maximum.reduceat(np.where(breaks, gain, 0), begins, axis=-1)
+    return found
 
 
 def _power_of_two_above(x: Numbers) -> Numbers:
