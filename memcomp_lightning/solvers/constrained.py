@@ -24,29 +24,29 @@ if TYPE_CHECKING:
 class PenaltyLoop:
     """Solve problems with constraints by a solver that knows none.
 
-    A round gives the solver the objective plus a penalty for each broken constraint, and mends its answers
+    A turn gives the solver the objective plus a penalty for each broken constraint, and mends its answers
     (:func:`~memcomp_lightning.solvers.repair.repair`). Penalties begin at what breaking the constraint may gain
     (:func:`local_penalties`): larger ones hide the objective. Where an answer with broken constraints has less
     energy than the best without, these constraints cost too little: their penalties double, in the second half of
-    the rounds all penalties, and the next round begins. Where none has after the first round, but its best answer
+    the turns all penalties, and the next turn begins. Where none has after the first turn, but its best answer
     would gain far less by breaking constraints (:func:`gains`), there is a second one with smaller penalties.
-    Where no answer keeps all constraints, the last round takes penalties with which breaking one never pays; so it
+    Where no answer keeps all constraints, the last turn takes penalties with which breaking one never pays; so it
     does for a solver that proves its minima.
 
     Attributes:
         solver: The solver.
-        n_rounds: Most rounds, >= 1.
+        n_turns: Most turns, >= 1.
     """
 
     solver: QuboSolver
-    n_rounds: int = 8
+    n_turns: int = 8
 
     def __post_init__(self) -> None:
         require_parts("solver", self.solver, "solver", ("minimise",))
-        require_count("n_rounds", self.n_rounds)
+        require_count("n_turns", self.n_turns)
 
     def minimise(self, problem: Constrained, *, generator: "Generator") -> QuboSolution:
-        """Return the answers of all rounds, mended, with the number of constraints that each still breaks.
+        """Return the answers of all turns, mended, with the number of constraints that each still breaks.
 
         Energies are those of the objective. A minimum that the solver proves is OPTIMAL here if it breaks nothing;
         if it breaks something although that never pays, it is INFEASIBLE.
@@ -54,7 +54,7 @@ class PenaltyLoop:
         begin = time.perf_counter() - compiling.seconds_spent()
         rows, penalties, safe = problem.constraints, local_penalties(problem), safe_penalty(problem)
         found, lowest = list[QuboSolution](), np.full(problem.objective.problems, np.inf)
-        for k in range(self.n_rounds):
+        for k in range(self.n_turns):
             given = problem.penalised(as_array(penalties))
             if not getattr(self.solver, "takes_clauses", False):
                 given = as_qubo(given)
@@ -70,13 +70,13 @@ class PenaltyLoop:
             too_cheap = (broken & pays[..., None]).any(-2) & (penalties < safe)
             enough = np.clip(gains(problem, found[-1].best), penalties / 4, penalties)
             if too_cheap.any():
-                dearer = too_cheap | (k >= self.n_rounds // 2)
+                dearer = too_cheap | (k >= self.n_turns // 2)
                 penalties = np.where(dearer, np.minimum(2 * penalties, safe), penalties)
             elif k == 0 and kept.all() and enough.sum() < penalties.sum() / 2:
                 penalties = enough
             else:
                 break
-            if k == self.n_rounds - 2:
+            if k == self.n_turns - 2:
                 proves = to_numpy(solution.status == int(Status.OPTIMAL)).all(-1)
                 penalties = np.where((np.isinf(lowest) | proves)[..., None], safe, penalties)
         concat = namespace(found[0].energies).concat
@@ -95,7 +95,7 @@ class PenaltyLoop:
 
 
 def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: Array) -> QuboSolution:
-    """The answers of a round, in the terms of the problem.
+    """The answers of a turn, in the terms of the problem.
 
     Args:
         problem: The problem.

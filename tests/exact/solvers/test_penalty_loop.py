@@ -10,7 +10,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.problems import Constrained, Linear, Qubo, WeightedMaxSat, clause, exactly
+from memcomp_lightning.problems import Constrained, Linear, Qubo, WeightedMaxSat, as_qubo, clause, exactly
 from memcomp_lightning.solvers import (
     AlternatingDescent,
     BruteForce,
@@ -20,6 +20,7 @@ from memcomp_lightning.solvers import (
     Status,
     TabuSearch,
 )
+from memcomp_lightning.solvers.constrained import gains, local_penalties, safe_penalty
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver
 from memcomp_lightning.solvers.repair import repair
 
@@ -149,6 +150,45 @@ def test_a_batch_of_objectives(solver):
             np.testing.assert_allclose(solution.best_energy, lowest)
 
 
+def test_in_a_vertex_cover_a_penalty_is_the_weight_of_the_lighter_end():
+    weights, edges = [5.0, 9.0, 7.0, 4.0], [(1, 2), (2, 3), (3, 4), (1, 4)]
+    objective = WeightedMaxSat.from_clauses(4, [[-i] for i in range(1, 5)], weights)
+    problem = Constrained.of(objective, [clause(edge) for edge in edges])
+    assert local_penalties(problem).tolist() == [5.0, 7.0, 4.0, 4.0]
+
+
+def test_breaking_a_constraint_never_pays_with_safe_penalties():
+    n_feasible = 0
+    for seed in range(24):
+        problem = random_problem(seed)
+        broken, energies = ranks(problem)
+        if broken.min() == 0:
+            penalised = problem.penalised(np.full(len(problem.constraints), safe_penalty(problem)))
+            solution = BruteForce().minimise(as_qubo(penalised), generator=rng.numpy_stream(0, "solver"))
+            lowest = float(solution.best_energy)
+            assert lowest == pytest.approx(energies[broken == 0].min())
+            n_feasible += 1
+    assert n_feasible > 12
+
+
+def test_gains_are_those_of_single_flips():
+    for seed in range(24):
+        problem = random_problem(seed)
+        broken, energies = ranks(problem)
+        if broken.min() > 0:
+            continue
+        states = binary_states(N, like=np.zeros(0))
+        x = states[np.where(broken == 0, energies, np.inf).argmin()]
+        expected = np.zeros(len(problem.constraints))
+        for i in range(N):
+            flipped = np.where(np.arange(N) == i, 1 - x, x)
+            rows = problem.constraints
+            breaks = rows.excess(rows.sums(flipped > 0.5)) > 0
+            gain = float(problem.energy(x[None])[0] - problem.energy(flipped[None])[0])
+            expected = np.maximum(expected, np.where(breaks, gain, 0))
+        np.testing.assert_allclose(gains(problem, x), expected, atol=1e-9)
+
+
 def test_penalties_rise_until_breaking_does_not_pay():
     """Each flip is cheap to undo alone, but the two constraints bar the way: the first penalties are too low."""
     clauses = [[i] for i in range(1, 7)]
@@ -195,7 +235,7 @@ def test_no_constraints_and_long_clauses():
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"solver": 3}, "a solver, which has minimise"), ({"solver": BruteForce(), "n_rounds": 0}, "n_rounds = 0")],
+    [({"solver": 3}, "a solver, which has minimise"), ({"solver": BruteForce(), "n_turns": 0}, "n_turns = 0")],
 )
 def test_refusals(settings, message):
     with pytest.raises(SettingError, match=message):
