@@ -2,6 +2,7 @@
 
 python experiments/hard_clauses/run.py                      # all families, about ten minutes on one core
 python experiments/hard_clauses/run.py potts scheduling
+python experiments/hard_clauses/run.py table                # prints the tables as they stand
 """
 
 import csv
@@ -77,6 +78,21 @@ def rows(family: Any) -> list[dict[str, Any]]:
     return table
 
 
+def markdown(table: list[dict[str, Any]]) -> str:
+    """Median cost, less the lowest that anybody found or proved, and median seconds."""
+    lines = []
+    for row in table:
+        costs = [float(row[f"{label} lowest"]) for label in SOLVERS]
+        known = float(row["RC2"]) if row["RC2"] else min(costs)
+        proof = f"{float(row['RC2 seconds']):.2g} s" if row["RC2"] else f"> {RC2_SECONDS:g} s"
+        cells = [row["instance"], f"{row['variables']}", f"{known:g}", proof]
+        for label in SOLVERS:
+            above = float(row[label]) - known
+            cells.append(f"{f'+{above:g}' if above else '='} in {float(row[f'{label} seconds']):.2g} s")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     wanted = sys.argv[1:]
     for family in FAMILIES:
@@ -87,6 +103,11 @@ def main() -> None:
             writer = csv.DictWriter(file, list(table[0]))
             writer.writeheader()
             writer.writerows(table)
+    titles = ["instance", "variables", "lowest known", "RC2", *SOLVERS]
+    print(f"| {' | '.join(titles)} |\n|{' --- |' * len(titles)}")
+    for path in sorted(Path(__file__).parent.glob("*.csv")):
+        with path.open(newline="") as file:
+            print(markdown(list(csv.DictReader(file))))
 
 
 if __name__ == "__main__":

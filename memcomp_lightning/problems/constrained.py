@@ -217,6 +217,8 @@ class Constrained:
             penalties: What each constraint costs that is broken by one, ``(*problems, n_constraints)``.
         """
         objective, rows = self.objective, self.constraints
+        if isinstance(objective, Qubo):
+            objective = objective.floating()
         like = objective.linear if isinstance(objective, Qubo) else objective.unit
         weights = cast(alike(penalties, like), like.dtype)
         if isinstance(objective, WeightedMaxSat) and rows.are_clauses:

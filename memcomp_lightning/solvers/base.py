@@ -99,7 +99,7 @@ class QuboSolution:
 
     def lowest(self, n: int) -> "QuboSolution":
         """The ``n`` restarts of lowest energy of each problem, lowest first, or all if they are fewer."""
-        xp, order = namespace(self.energies), namespace(self.energies).argsort(self.energies, axis=-1)[..., :n]
+        xp, order = namespace(self.energies), namespace(self.energies).argsort(self._ranked, axis=-1)[..., :n]
         places = xp.broadcast_to(order[..., None], (*order.shape, self.assignments.shape[-1]))
         return replace(
             self,
@@ -107,6 +107,7 @@ class QuboSolution:
             energies=xp.take_along_axis(self.energies, order, axis=-1),
             status=xp.take_along_axis(self.status, order, axis=-1),
             steps=xp.take_along_axis(self.steps, order, axis=-1),
+            broken=None if self.broken is None else xp.take_along_axis(self.broken, order, axis=-1),
             population=None if self.population is None else xp.take_along_axis(self.population, order, axis=-1),
         )
 

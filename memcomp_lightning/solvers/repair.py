@@ -1,10 +1,12 @@
 """Mend broken constraints by flips, then lower the objective by flips that break none."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.arrays import Array, alike, cast, double, to_numpy
-from memcomp_lightning.problems import Qubo, WeightedMaxSat
+from memcomp_lightning.arrays import Array, alike, cast, to_numpy
+from memcomp_lightning.problems import WeightedMaxSat
 from memcomp_lightning.problems.constrained import Constrained, sums_of
 from memcomp_lightning.problems.rows import Integers
 from memcomp_lightning.solvers.compiled import grouped
@@ -32,9 +34,10 @@ def repair(problem: Constrained, x: Array) -> Array:
         after = rows.excess(sums[..., row] + change, row)
         broken = sums_of(((after > 0) * 1 - (before > 0))[..., order], ends)
         excess = sums_of((after - before)[..., order], ends)
-        costs = _costs(problem.objective, x, state)
+        field = to_numpy(problem.objective.field(cast(alike(state, x), x.dtype)))
+        costs = np.where(state, -field, field)
         mends = (broken < 0) | ((broken == 0) & (excess < 0))
-        lowers = (broken == 0) & (excess == 0) & (costs < -_LEAST * np.abs(costs).max(initial=0.0))
+        lowers = (broken == 0) & (excess == 0) & (costs < -_rounding(costs))
         good = mends | lowers
         if not good.any():
             return cast(alike(np.ascontiguousarray(state), x), x.dtype)
@@ -42,14 +45,10 @@ def repair(problem: Constrained, x: Array) -> Array:
         state = state ^ (good & around.first(np.lexsort((price, ~mends, ~good))))
 
 
-_LEAST = 1e-12
-"""What lowers the objective by less, as a share of the largest change, may be a rounding error."""
-
-
-def _costs(objective: Qubo | WeightedMaxSat, x: Array, state: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """What each flip adds to the objective, ``(*problems, n_states, n)``."""
-    field = to_numpy(double(objective.field(cast(alike(state, x), x.dtype))))
-    return np.where(state, -field, field)
+def _rounding(costs: NDArray[Any]) -> float:
+    """A bound on the rounding of these sums: what changes the objective by less may not change it at all."""
+    unit = np.finfo(costs.dtype).eps if costs.dtype.kind == "f" else 0.0
+    return float(1000 * unit * np.abs(costs).max(initial=0.0))
 
 
 class _Neighbours:

@@ -122,6 +122,22 @@ def test_a_repair_breaks_nothing_and_ends_where_no_flip_helps(like):
             assert not (cheaper & (of_found == 0) & (of_flipped == 0)).any()
 
 
+def test_a_repair_of_single_precision_ends():
+    entries = np.random.default_rng(0).normal(size=(60, 60)).astype(np.float32)
+    problem = Constrained.of(Qubo.from_matrix(entries), [clause([i, i + 1]) for i in range(1, 60)])
+    states = np.random.default_rng(1).integers(0, 2, (200, 60)).astype(np.float32)
+    assert (problem.n_broken(repair(problem, states)) <= problem.n_broken(states)).all()
+
+
+def test_an_objective_of_whole_numbers():
+    entries = np.random.default_rng(0).integers(-5, 6, (N, N))
+    rows = [exactly(2, range(N))]
+    whole, real = (Constrained.of(Qubo.from_matrix(q), rows) for q in (entries, entries.astype(np.float64)))
+    found = PenaltyLoop(solver=SOLVERS["tabu"]).minimise(whole, generator=rng.numpy_stream(0, "solver"))
+    broken, energies = ranks(real)
+    assert float(found.best_energy) == energies[broken == 0].min()
+
+
 def test_what_shares_nothing_is_mended_in_one_pass(monkeypatch):
     """A thousand broken pairs, side by side: as many steps as one."""
     rows = [exactly(1, [2 * k, 2 * k + 1]) for k in range(1000)]
