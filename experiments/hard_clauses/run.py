@@ -21,8 +21,8 @@ from memcomp_lightning import rng
 from memcomp_lightning.solvers import GibbsAnnealing, PenaltyLoop, Portfolio
 from memcomp_lightning.solvers.dmm import DmmSolver
 
-RC2_SECONDS = 20.0
-N_SEEDS = 5
+RC2_SECONDS = 10.0
+N_SEEDS = 3
 SOLVERS = {
     "best": lambda n: Portfolio(),
     "annealing": lambda n: GibbsAnnealing(n_sweeps=1000),

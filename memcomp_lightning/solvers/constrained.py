@@ -29,7 +29,7 @@ class PenaltyLoop:
     (:func:`local_penalties`): larger ones hide the objective. Where an answer with broken constraints has less
     energy than the best without, these constraints cost too little: their penalties double, in the second half of
     the turns all penalties, and the next turn begins. Where none has after the first turn, but its best answer
-    would gain far less by breaking constraints (:func:`gains`), there is a second one with smaller penalties.
+    would gain less by breaking constraints (:func:`gains`), there is a second one with smaller penalties.
     Where no answer keeps all constraints, the last turn takes penalties with which breaking one never pays; so it
     does for a solver that proves its minima.
 
@@ -72,7 +72,7 @@ class PenaltyLoop:
             if too_cheap.any():
                 dearer = too_cheap | (k >= self.n_turns // 2)
                 penalties = np.where(dearer, np.minimum(2 * penalties, safe), penalties)
-            elif k == 0 and kept.all() and enough.sum() < penalties.sum() / 2:
+            elif k == 0 and kept.all() and enough.sum() < 0.75 * penalties.sum():
                 penalties = enough
             else:
                 break
