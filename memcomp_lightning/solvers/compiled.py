@@ -251,15 +251,16 @@ def share(
     """
     forget_outdated(kernel, tuple(inlined))
     stop, limit = np.zeros(1, np.uint8), _LIMIT.get() if anytime else None
-    most = min(n_threads(), n_items)
-    if most <= 1 and work < _SHORT and limit is None:
+    most, left = min(n_threads(), n_items), math.inf if limit is None else limit.until - time.perf_counter()
+    if most <= 1 and work < _SHORT and left > _SHORT_S:
         kernel(0, n_items, stop, *arguments)
         return True
     if not kernel.signatures:
         kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
     cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
     jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
-    left = math.inf if limit is None else limit.until - time.perf_counter()
+    if limit is not None:  # compilation has taken its time
+        left = limit.until - time.perf_counter()
     try:
         _, late = wait(jobs, None if left == math.inf else max(left, 0.0))
         stop[0] = 1
@@ -305,8 +306,8 @@ def limited(until: float) -> Iterator[Limit]:
         _LIMIT.reset(token)
 
 
-_SHORT = 2e8
-"""Work of less than about a second."""
+_SHORT, _SHORT_S = 2e8, 2.0
+"""Work of less than about a second, and seconds within which it comes to its end."""
 
 
 @cache

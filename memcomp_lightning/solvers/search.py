@@ -17,7 +17,7 @@ from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.constrained import Constrained
 from memcomp_lightning.problems.files.numbers import Exact
-from memcomp_lightning.problems.maxsat import as_qubo
+from memcomp_lightning.problems.maxsat import WeightedMaxSat, as_qubo
 from memcomp_lightning.problems.problem import Problem
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.answer import in_full_of
@@ -89,16 +89,14 @@ class Search:
                 record.offer(initial)
             if initial is not None and not record.settled:
                 record.improve(initial, rng.numpy_stream(seed, "initial states"))
-            self._rounds(record, problem, solver, generator)
+            self._rounds(record, solver, generator)
         except KeyboardInterrupt:
             if not record.states:
                 raise
             return replace(record.found(), interrupted=True)
         return record.found()
 
-    def _rounds(
-        self, record: "_Record", problem: Given, solver: QuboSolver, generator: np.random.Generator
-    ) -> None:
+    def _rounds(self, record: "_Record", solver: QuboSolver, generator: np.random.Generator) -> None:
         """Solve, and tell the record."""
         if isinstance(solver, Portfolio):
             record.prove()
@@ -108,7 +106,7 @@ class Search:
             solution = record.solve(solver, generator)
             if not record.settled:
                 record.bound()
-            left, took = record.left, record.seconds - begin
+            left, took = record.left, max(record.seconds - begin, 1e-9)
             if one_call or record.settled or left < _WORTH * took:
                 break
             solver = _longer(solver, min(2.0, left / took), int(solution.steps.max()))
@@ -149,7 +147,7 @@ class _Record:
         self._begin = time.perf_counter() - compiling.seconds_spent()
         self._search, self._problem, self._callback = search, problem, callback
         self._given = given = numbers_of(problem)
-        self._qubo = as_qubo(given)
+        self._qubo = None if isinstance(given, WeightedMaxSat) and given.longer else as_qubo(given)
         self._unit = unit_of(problem)
         self._noise = 10 * rounding(parts_of(given)) if self._unit is None else 0.0
         self._resolution = 0.75 * self._unit if self._unit else self._noise
@@ -257,9 +255,8 @@ class _Record:
             if any(_rank(state) <= (n_broken, energy + self._noise) for state in close):
                 continue
             state, nearby = State(x, energy, self.seconds, n_broken), [id(other) for other in close]
-            self.states = sorted([*(other for other in states if id(other) not in nearby), state], key=_rank)[
-                :most
-            ]
+            apart = [other for other in states if id(other) not in nearby]
+            self.states = sorted([*apart, state], key=_rank)[:most]
             if not n_broken and (not self._curve or energy < self._curve[-1][1] - self._noise):
                 self._curve.append((state.seconds, energy))
                 if self._callback is not None:
@@ -267,7 +264,7 @@ class _Record:
 
     def improve(self, x: Bits, generator: np.random.Generator) -> None:
         """Offer what short tabu searches find from these states, if the problem is as plain as they are."""
-        if self._qubo.n == self._given.n > 0 and constrained_of(self._problem) is None:
+        if self._qubo is not None and self._qubo.n and constrained_of(self._problem) is None:
             start = cast(alike(x, self._qubo.linear), self._qubo.linear.dtype)
             solver = TabuSearch(n_restarts=len(x), n_steps=max(10, self._qubo.n))
             with self._within(self.left):
@@ -276,17 +273,17 @@ class _Record:
 
     def prove(self) -> None:
         """Look for a proof that takes little time, and else for a lower bound."""
-        if self._qubo.n == 0 or isinstance(self._problem, Constrained):
+        if self._qubo is None or not self._qubo.n or isinstance(self._problem, Constrained):
             return
         minimum = eliminated(self._qubo)
         if minimum is None and (dual := self.bound()) is not None:
             minimum = dual.minimum
         if minimum is not None:
-            self.add(_proven(self._qubo, minimum, self._given.n))
+            self.add(_proven(self._qubo, minimum))
 
     def bound(self) -> RoofDual | None:
         """Look for a lower bound, unless there is one, or the problem is small enough to be enumerated."""
-        if self._qubo.n <= MOST_ENUMERATED or self._lower_bound > -math.inf:
+        if self._qubo is None or self._qubo.n <= MOST_ENUMERATED or self._lower_bound > -math.inf:
             return None
         dual = roof_dual(self._qubo)
         if dual is not None:
@@ -322,12 +319,12 @@ def _rank(state: State) -> tuple[int, Exact | float]:
     return state.n_broken, state.energy
 
 
-def _proven(qubo: Qubo, minimum: Bits, n: int) -> QuboSolution:
-    """A solution of one restart; variables after the first ``n`` are auxiliary ones."""
+def _proven(qubo: Qubo, minimum: Bits) -> QuboSolution:
+    """A solution of one restart."""
     x = cast(alike(minimum[None], qubo.linear), qubo.linear.dtype)
     ended = Status.ROUNDED if bool(qubo.rounds()) else Status.OPTIMAL
     status, steps = (alike(np.array([number]), x) for number in (int(ended), qubo.n))
-    return QuboSolution(x[:, :n], double(qubo.energy(x)), status, steps, wall_time_s=0.0)
+    return QuboSolution(x, double(qubo.energy(x)), status, steps, wall_time_s=0.0)
 
 
 def unit_of(problem: Given) -> float | None:
