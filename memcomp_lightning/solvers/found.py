@@ -10,7 +10,7 @@ from memcomp_lightning.solvers.base import QuboSolution, RecordedStates, Status
 PROVEN = (Status.OPTIMAL, Status.INFEASIBLE, Status.ROUNDED)
 """How a search of all states ends: another one would end likewise."""
 
-LEAST_AGREEING, SHARE_AGREEING = 3, 1 / 3
+LEAST_AGREEING, SHARE_AGREEING = 3, 1 / 2
 """Restarts that must have reached the best energy, and the share of the populations, for ``AGREED``."""
 
 
@@ -77,7 +77,7 @@ class Found:
 
     @property
     def agree(self) -> bool:
-        """Whether three restarts end at the best energy, in two populations and in a third of all, at least.
+        """Whether three restarts end at the best energy, in two populations and in half of all, at least.
 
         Descents that CONVERGED do not count: many of them may end in the same wrong minimum.
         """
