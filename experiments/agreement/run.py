@@ -1,6 +1,6 @@
 """How often AGREED is wrong, on problems whose minima are known.
 
-python experiments/agreement/run.py               # 10,002 problems, a quarter of an hour on one core
+python experiments/agreement/run.py               # 10,002 problems, ten minutes on one core
 python experiments/agreement/run.py --problems 50 # of each family, to try it
 """
 
