@@ -314,7 +314,6 @@ def ended(energies, status=(), best=None, **settings):
         (ended([1.0, 1.0], population=[0, 1]), Status.STEP_BUDGET, 2),
         (ended([1.0] * 5, [Status.CONVERGED] * 3), Status.CONVERGED, 5),
         (ended([1.0] * 5, [Status.CONVERGED] * 2), Status.AGREED, 5),
-        (ended([1.0] * 5, [Status.CONVERGED] * 3), Status.CONVERGED, 5),
         (ended([1.0, 1.0 + 1e-9, 1.0], resolution=1e-8), Status.AGREED, 3),
         (ended([1.0, 1.0 + 1e-9, 1.0]), Status.STEP_BUDGET, 2),
         (ended([2.0, 1.0, 3.0], [Status.CONVERGED, Status.STILL_IMPROVING]), Status.STILL_IMPROVING, 1),
