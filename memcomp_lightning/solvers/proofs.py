@@ -73,13 +73,16 @@ class RoofDual(NamedTuple):
 MOST_PAIRS = 200_000
 """Couplings up to which a roof dual takes less than half a second."""
 
+MOST_A_VARIABLE = 10
+"""Couplings a variable beyond which the bound is so weak that it is not worth importing a package for."""
+
 
 def roof_dual(qubo: Qubo) -> RoofDual | None:
-    """The lower bound of one problem by roof duality; None where it would take long or its package is missing.
+    """The lower bound of one problem by roof duality; None where it is weak, takes long or its package is missing.
 
     A maximum flow gives the bound (Boros & Hammer 2002), dwave-preprocessing the flow.
     """
-    if math.prod(qubo.graph.edge_shape) > MOST_PAIRS:
+    if math.prod(qubo.graph.edge_shape) > min(MOST_PAIRS, MOST_A_VARIABLE * qubo.n):
         return None
     try:
         from dwave.preprocessing import roof_duality
