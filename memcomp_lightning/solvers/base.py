@@ -1,6 +1,7 @@
 """What every solver of a QUBO takes and gives back, and how each restart ended."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Protocol
@@ -101,15 +102,24 @@ class QuboSolution:
         """The ``n`` restarts of lowest energy of each problem, lowest first, or all if they are fewer."""
         xp, order = namespace(self.energies), namespace(self.energies).argsort(self._ranked, axis=-1)[..., :n]
         places = xp.broadcast_to(order[..., None], (*order.shape, self.assignments.shape[-1]))
-        return replace(
-            self,
-            assignments=xp.take_along_axis(self.assignments, places, axis=-2),
-            energies=xp.take_along_axis(self.energies, order, axis=-1),
-            status=xp.take_along_axis(self.status, order, axis=-1),
-            steps=xp.take_along_axis(self.steps, order, axis=-1),
-            broken=None if self.broken is None else xp.take_along_axis(self.broken, order, axis=-1),
-            population=None if self.population is None else xp.take_along_axis(self.population, order, axis=-1),
+        chosen = {name: xp.take_along_axis(part, order, axis=-1) for name, part in self._of_restarts().items()}
+        return replace(self, assignments=xp.take_along_axis(self.assignments, places, axis=-2), **chosen)
+
+    @staticmethod
+    def joined(parts: "Sequence[QuboSolution]", wall_time_s: float) -> "QuboSolution":
+        """The restarts of several solutions of the same problems, with the trajectory of the last one."""
+        concat, rows = namespace(parts[0].energies).concat, [part._of_restarts() for part in parts]
+        return QuboSolution(
+            assignments=concat([part.assignments for part in parts], axis=-2),
+            wall_time_s=wall_time_s,
+            trajectory=parts[-1].trajectory,
+            **{name: concat([row[name] for row in rows], axis=-1) for name in rows[0]},
         )
+
+    def _of_restarts(self) -> dict[str, Array]:
+        """What there is one number a restart of, ``(*problems, n_restarts)``."""
+        names = ("energies", "status", "steps", "broken", "population")
+        return {name: part for name in names if (part := getattr(self, name)) is not None}
 
     def messages(self) -> dict[str, int]:
         """How many restarts ended in each way, keyed by name and advice."""

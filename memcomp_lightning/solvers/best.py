@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from memcomp_lightning import compiling
-from memcomp_lightning.arrays import namespace
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.graph import Bipartite
 from memcomp_lightning.problems.qubo import Qubo
@@ -75,14 +74,7 @@ class Portfolio:
         if n_annealed < n_left:
             rest.append(replace(search, n_restarts=n_left - n_annealed))
         found += [solver.minimise(qubo, generator=generator) for solver in rest]
-        concat = namespace(found[0].energies).concat
-        return QuboSolution(
-            assignments=concat([solution.assignments for solution in found], axis=-2),
-            energies=concat([solution.energies for solution in found], axis=-1),
-            status=concat([solution.status for solution in found], axis=-1),
-            steps=concat([solution.steps for solution in found], axis=-1),
-            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
-        )
+        return QuboSolution.joined(found, time.perf_counter() - compiling.seconds_spent() - begin)
 
     def _of(self, n: int) -> int:
         """So many sweeps, times the effort."""

@@ -79,19 +79,7 @@ class PenaltyLoop:
             if k == self.n_turns - 2:
                 proves = to_numpy(solution.status == int(Status.OPTIMAL)).all(-1)
                 penalties = np.where((np.isinf(lowest) | proves)[..., None], safe, penalties)
-        concat = namespace(found[0].energies).concat
-        return QuboSolution(
-            assignments=concat([solution.assignments for solution in found], axis=-2),
-            energies=concat([solution.energies for solution in found], axis=-1),
-            status=concat([solution.status for solution in found], axis=-1),
-            steps=concat([solution.steps for solution in found], axis=-1),
-            wall_time_s=time.perf_counter() - compiling.seconds_spent() - begin,
-            trajectory=found[-1].trajectory,
-            broken=concat([solution.broken for solution in found], axis=-1),
-            population=None
-            if found[0].population is None
-            else concat([solution.population for solution in found], axis=-1),
-        )
+        return QuboSolution.joined(found, time.perf_counter() - compiling.seconds_spent() - begin)
 
 
 def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: Array) -> QuboSolution:
