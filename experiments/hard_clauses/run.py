@@ -5,10 +5,10 @@ python experiments/hard_clauses/run.py potts scheduling
 python experiments/hard_clauses/run.py table                # prints the tables as they stand
 """
 
+import argparse
 import csv
 import multiprocessing
 import random
-import sys
 import time
 from pathlib import Path
 from statistics import median
@@ -95,7 +95,13 @@ def markdown(table: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    wanted = sys.argv[1:]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [family.__name__ for family in FAMILIES]
+    parser.add_argument("families", nargs="*", help=f"of {', '.join(names)}, or table: run nothing; default: all")
+    wanted = parser.parse_args().families
+    unknown = sorted(set(wanted) - {*names, "table"})
+    if unknown:
+        parser.error(f"{', '.join(unknown)}: expected some of {', '.join(names)}, or table")
     for family in FAMILIES:
         if wanted and family.__name__ not in wanted:
             continue

@@ -109,6 +109,13 @@ class QuboSolution:
     def joined(parts: "Sequence[QuboSolution]", wall_time_s: float) -> "QuboSolution":
         """The restarts of several solutions of the same problems, with the trajectory of the last one."""
         concat, rows = namespace(parts[0].energies).concat, [part._of_restarts() for part in parts]
+        if any("population" in row for row in rows):
+            first = 0
+            for row in rows:
+                each = namespace(row["status"]).ones_like(row["status"])
+                alone = namespace(each).cumulative_sum(each, axis=-1) - 1
+                row["population"] = first + row.get("population", alone)
+                first += row["status"].shape[-1]
         return QuboSolution(
             assignments=concat([part.assignments for part in parts], axis=-2),
             wall_time_s=wall_time_s,

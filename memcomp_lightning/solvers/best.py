@@ -12,7 +12,7 @@ from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.annealing import GibbsAnnealing
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver
 from memcomp_lightning.solvers.brute_force import BruteForce
-from memcomp_lightning.solvers.compiled import without_zeros
+from memcomp_lightning.solvers.compiled import SPARSE, without_zeros
 from memcomp_lightning.solvers.crossover import CrossoverAnnealing
 from memcomp_lightning.solvers.tabu import TabuSearch
 
@@ -27,10 +27,10 @@ MOST_ENUMERATED = 12
 class Portfolio:
     """Solve QUBOs by what suits them.
 
-    Few variables are enumerated, listed pairs annealed with crossover. In two full layers an eighth of the
+    Few variables are enumerated, sparse graphs annealed with crossover. In two full layers an eighth of the
     restarts anneal and an eighth search by tabu, each for about the same time; where the best of them differ, the
-    better method does the rest, where they agree, both do. What was found decides, not a clock: the same seed
-    gives the same answer on every machine.
+    better method does the rest, where they agree, both do. So it is in other dense problems, with crossover. What
+    was found decides, not a clock: the same seed gives the same answer on every machine.
 
     Attributes:
         n_restarts: Starts for each problem, >= 1.
@@ -51,23 +51,37 @@ class Portfolio:
         if enumerated <= MOST_ENUMERATED:
             return BruteForce(max_variables=MOST_ENUMERATED).minimise(qubo, generator=generator)
         qubo = without_zeros(qubo)
-        if not isinstance(qubo.graph, Bipartite):
-            crossover = CrossoverAnnealing(n_restarts=self.n_restarts)
-            crossover = replace(crossover, n_sweeps=self._of(crossover.n_sweeps))
+        if isinstance(qubo.graph, Bipartite):
+            n_sweeps = self._of(default_sweeps(qubo))
+            anneal, n_trial = GibbsAnnealing(n_sweeps=n_sweeps), max(1, self.n_restarts // 8)
+            steps = round(n_sweeps * qubo.n * STEPS_A_SWEEP)
+            return self._of_two(anneal, n_trial, TabuSearch(n_steps=max(1, steps)), qubo, generator)
+        crossover = CrossoverAnnealing(n_restarts=self.n_restarts)
+        crossover = replace(crossover, n_sweeps=self._of(crossover.n_sweeps))
+        if len(qubo.graph.edges()) < SPARSE * qubo.n * (qubo.n - 1) / 2:
             return crossover.minimise(qubo, generator=generator)
-        return self._of_layers(qubo, generator)
+        search = TabuSearch(n_steps=self._of(100 * qubo.n))
+        return self._of_two(crossover, (self.n_restarts + 1) // 2, search, qubo, generator)
 
-    def _of_layers(self, qubo: Qubo, generator: "Generator") -> QuboSolution:
-        """Trials of annealing and tabu search, then the better one."""
+    def _of_two(
+        self,
+        anneal: "GibbsAnnealing | CrossoverAnnealing",
+        n_trial: int,
+        search: TabuSearch,
+        qubo: Qubo,
+        generator: "Generator",
+    ) -> QuboSolution:
+        """Trials of annealing and tabu search, then the better one; ``n_trial`` restarts of the first."""
         begin = time.perf_counter() - compiling.seconds_spent()
-        n_trial, n_sweeps = max(1, self.n_restarts // 8), self._of(default_sweeps(qubo))
-        anneal = GibbsAnnealing(n_restarts=n_trial, n_sweeps=n_sweeps)
-        search = TabuSearch(n_restarts=n_trial, n_steps=max(1, round(n_sweeps * qubo.n * STEPS_A_SWEEP)))
-        trials: list[QuboSolver] = [anneal, search] if self.n_restarts > 1 else [anneal]
+        n_searched = min(max(1, self.n_restarts // 8), self.n_restarts - n_trial)
+        trials: list[QuboSolver] = [replace(anneal, n_restarts=n_trial)]
+        if n_searched:
+            trials.append(replace(search, n_restarts=n_searched))
         found = [solver.minimise(qubo, generator=generator) for solver in trials]
         energies = [float(solution.best_energy.sum()) for solution in found]
-        n_left = self.n_restarts - n_trial * len(trials)
-        n_annealed = n_left // 2 if energies[0] == energies[-1] else n_left if energies[0] < energies[-1] else 0
+        agree = math.isclose(energies[0], energies[-1], rel_tol=_ROUNDING)
+        n_left = self.n_restarts - n_trial - n_searched
+        n_annealed = n_left // 2 if agree else n_left if energies[0] < energies[-1] else 0
         rest: list[QuboSolver] = []
         if n_annealed:
             rest.append(replace(anneal, n_restarts=n_annealed))
@@ -80,6 +94,9 @@ class Portfolio:
         """So many sweeps, times the effort."""
         return max(1, round(self.effort * n))
 
+
+_ROUNDING = 1e-9
+"""Energies of one state differ by less between libraries and processors, of two states by more."""
 
 STEPS_A_SWEEP = 0.02
 """Steps of a tabu search that take about as long as a sweep of annealing, a variable."""
