@@ -14,8 +14,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from instances import FAMILIES, Instance
 from pysat.examples.rc2 import RC2Stratified
+from structured import FAMILIES, Instance
 
 from memcomp_lightning import rng
 from memcomp_lightning.solvers import GibbsAnnealing, PenaltyLoop, Portfolio, TabuSearch

@@ -33,6 +33,9 @@ class MemcompSampler(dimod.Sampler, dimod.Initialized):  # type: ignore[misc,nam
     def __init__(self, solver: QuboSolver | None = None) -> None:
         self.solver = Portfolio() if solver is None else solver
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.solver!r})"
+
     @property
     def parameters(self) -> dict[str, list[str]]:
         """Keyword arguments of :meth:`sample`."""

@@ -13,16 +13,16 @@ from memcomp_lightning.solvers.dmm import DmmSolver
 pytest.importorskip("pysat")
 sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "hard_clauses"))
 
-import instances
+import structured
 from pysat.examples.rc2 import RC2
 
 FAMILIES = {
-    instances.vertex_cover: (60, 120),
-    instances.colouring: (14, 30),
-    instances.scheduling: (8, 4, 12),
-    instances.random_clauses: (30, 90, 60),
-    instances.potts: (12, 28),
-    instances.k_of_n: (12, 4),
+    structured.vertex_cover: (60, 120),
+    structured.colouring: (14, 30),
+    structured.scheduling: (8, 4, 12),
+    structured.random_clauses: (30, 90, 60),
+    structured.potts: (12, 28),
+    structured.k_of_n: (12, 4),
 }
 SOLVERS = {
     "best": Portfolio(n_restarts=112, effort=4.0),
