@@ -60,15 +60,21 @@ class Task(NamedTuple):
         return row is not None and not row["error"] and row["fingerprint"] == self.row["fingerprint"]
 
 
-def tasks_of(file: Path, combinations: Sequence[Combination], table: Path, folder: Path) -> Iterator[Task]:
-    """The rows of a file, with a fingerprint of all that decides on the answer."""
+def _content(file: Path) -> str:
+    """A hash of what stands in a file."""
     try:
-        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}).") from error
-    name = stem(file).stem
+
+
+def tasks_of(file: Path, combinations: Sequence[Combination], table: Path, folder: Path) -> Iterator[Task]:
+    """The rows of a file, with a fingerprint of all that decides on the answer."""
+    content, name = _content(file), stem(file).stem
     for solver, settings, config in combinations:
         settled = {setting: value for setting, value in config.items() if setting != "problem"}
+        if settled.get("initial") is not None:
+            settled["initial"] = _content(Path(str(settled["initial"])).expanduser())
         made_of = json.dumps([content, settled, __version__], sort_keys=True, default=str)
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()[:16]
         solution = folder / f"{name}.{solver}.{config['seed']}.{fingerprint[:6]}.json"

@@ -91,5 +91,5 @@ def _state(file: str) -> list[int]:
         return [int(bit) for bit in bits]
     except OSError as error:
         raise UserError(f"initial={file} cannot be read ({error.strerror}).") from error
-    except (KeyError, ValueError):
+    except (KeyError, TypeError, ValueError):
         raise UserError(f"initial={file} holds no state: expected a solution.json, or zeros and ones.") from None

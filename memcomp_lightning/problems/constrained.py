@@ -93,7 +93,7 @@ class Constraints:
                 not outside, f"variables of constraint {number}", outside, f"integers from 0 to n - 1 = {n - 1}"
             )
             size = sum(map(abs, coefficients.values()))
-            whole = all(int(a) == a for a in (*coefficients.values(), lower or 0, upper or 0))
+            whole = all(math.isfinite(a) and int(a) == a for a in (*coefficients.values(), lower or 0, upper or 0))
             require(
                 whole and size < 2**31,
                 f"coefficients and bounds of constraint {number}",
@@ -140,6 +140,12 @@ class Constraints:
             (np.abs(self.coefficients) == 1).all()
         )
 
+    @property
+    def _may_break(self) -> NDArray[np.bool_]:
+        """Which rows some state breaks, ``(n_rows,)``."""
+        least, most = (sums_of(part(self.coefficients, 0), self.begins) for part in (np.minimum, np.maximum))
+        return (self.lower > least) | (self.upper < most)
+
     def sums(self, x: NDArray[np.bool_]) -> Integers:
         """``a . x`` of each row, ``(*leading, n_rows)``, of states ``(*leading, n)``."""
         return sums_of(np.where(x[..., self.variables], self.coefficients, 0), self.begins)
@@ -150,10 +156,12 @@ class Constraints:
 
     def blocks(self) -> Iterator[tuple[Integers, Integers, Integers, Integers, int]]:
         """Rows of one length and width: their numbers, variables, coefficients, smallest sums, and the width."""
-        width = np.maximum(self.upper - self.lower, 0)
+        width = self.upper - self.lower
         kinds, kind_of = np.unique(np.stack((self.lengths, width)), axis=1, return_inverse=True)
         for kind, (length, width_) in enumerate(kinds.T.tolist()):
-            rows = np.flatnonzero(kind_of == kind)
+            rows = np.flatnonzero((kind_of == kind) & self._may_break)
+            if not rows.size:
+                continue
             at = self.begins[rows, None] + np.arange(length)
             yield rows, self.variables[at], self.coefficients[at], self.lower[rows], width_
 

@@ -33,7 +33,7 @@ class Status(IntEnum):
     )
     NOT_RUN = 4, "Not run: enough restarts before it had found nothing better, or no time was left."
     STALLED = 5, "Nothing better for far longer than the best one took; more restarts may find a lower one."
-    INFEASIBLE = 6, "Every state was examined: none satisfies all hard clauses; this one breaks the fewest."
+    INFEASIBLE = 6, "Proven: no state keeps all constraints."
     ROUNDED = 7, "The search was complete, but float64 rounds sums of these numbers: another may be lower."
     NOT_FEASIBLE = 8, "No assignment that keeps all constraints was found; more restarts may find one."
     STOPPED = 9, "The time was up, or Ctrl-C came: a longer search may find a lower one."

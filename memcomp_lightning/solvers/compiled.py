@@ -256,7 +256,10 @@ def share(
         kernel(0, n_items, stop, *arguments)
         return True
     if not kernel.signatures:
+        before = compiling.seconds_spent()
         kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
+        if limit is not None:
+            limit.until += compiling.seconds_spent() - before
     cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
     jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
     if limit is not None:  # compilation has taken its time
@@ -287,6 +290,16 @@ class Limit:
 
     until: float
     interrupted: bool = False
+
+    @property
+    def is_past(self) -> bool:
+        """Whether a search should end now."""
+        return self.interrupted or time.perf_counter() >= self.until
+
+
+def limit_here() -> Limit | None:
+    """The limit of the context, if there is one."""
+    return _LIMIT.get()
 
 
 _LIMIT: ContextVar[Limit | None] = ContextVar("limit", default=None)

@@ -13,7 +13,7 @@ from memcomp_lightning.problems.constrained import Constrained, sums_of
 from memcomp_lightning.problems.maxsat import as_qubo, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
-from memcomp_lightning.solvers.compiled import Numbers
+from memcomp_lightning.solvers.compiled import Numbers, limit_here
 from memcomp_lightning.solvers.repair import repair
 
 if TYPE_CHECKING:
@@ -53,16 +53,23 @@ class PenaltyLoop:
         """
         begin = time.perf_counter() - compiling.seconds_spent()
         rows, penalties, safe = problem.constraints, local_penalties(problem), safe_penalty(problem)
-        found, lowest = list[QuboSolution](), np.full(problem.objective.problems, np.inf)
+        found, lowest, limit = list[QuboSolution](), np.full(problem.objective.problems, np.inf), limit_here()
         for k in range(self.n_turns):
             given = problem.penalised(as_array(penalties))
             if not getattr(self.solver, "takes_clauses", False):
                 given = as_qubo(given)
-            solution = self.solver.minimise(given, generator=generator)  # type: ignore[arg-type]
-            raw = solution.assignments[..., : problem.n]
-            broken = rows.excess(rows.sums(to_numpy(raw) > 0.5)) > 0
-            hopeless = alike(np.any(broken & (penalties >= safe)[..., None, :], axis=-1), raw)
-            found.append(_mended(problem, solution, raw, hopeless))
+            try:
+                solution = self.solver.minimise(given, generator=generator)  # type: ignore[arg-type]
+                raw = solution.assignments[..., : problem.n]
+                broken = rows.excess(rows.sums(to_numpy(raw) > 0.5)) > 0
+                hopeless = alike(np.any(broken & (penalties >= safe)[..., None, :], axis=-1), raw)
+                found.append(_mended(problem, solution, raw, hopeless))
+            except KeyboardInterrupt:
+                if limit is None or not found:
+                    raise
+                limit.interrupted = True
+            if limit is not None and limit.is_past:
+                break
             kept = to_numpy(problem.n_broken(found[-1].best)) == 0
             lowest = np.where(kept, np.minimum(to_numpy(found[-1].best_energy), lowest), lowest)
             # Less energy than the best answer that keeps all constraints: to break some pays.
@@ -91,7 +98,12 @@ def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: 
         raw: Their states of the problem's variables, ``(*problems, n_restarts, n)``.
         hopeless: Whether they break a constraint although that never pays, ``(*problems, n_restarts)``.
     """
-    xp, x, was_run = namespace(raw), repair(problem, raw), solution.energies < namespace(raw).inf
+    xp, was_run, limit = namespace(raw), solution.energies < namespace(raw).inf, limit_here()
+    late = limit is not None and limit.is_past and not problem.objective.problems
+    x = xp.asarray(raw, copy=True)
+    chosen = slice(int(solution.energies.argmin()), None) if late else slice(None)
+    chosen = slice(chosen.start, chosen.start + 1) if late else chosen
+    x[..., chosen, :] = repair(problem, raw[..., chosen, :])
     broken = xp.where(was_run, problem.n_broken(x), len(problem.constraints))
     energies = xp.where(was_run, problem.energy(x), xp.inf)
     proven = solution.status == int(Status.OPTIMAL)

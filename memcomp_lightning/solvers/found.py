@@ -93,6 +93,8 @@ class Found:
         proven = next((status for status in PROVEN if status in ends), None)
         if proven is not None:
             return proven
+        if self.states[0].n_broken and Status.INFEASIBLE in self.status:
+            return Status.INFEASIBLE
         if not self.states[0].n_broken:
             if self.states[0].energy - self.lower_bound <= self.resolution:
                 return Status.OPTIMAL

@@ -109,4 +109,4 @@ def parts_of(problem: Qubo | WeightedMaxSat) -> list[Array]:
 
 def rounding(numbers: Sequence[Array]) -> float:
     """Bound on the rounding of a sum of them in float64."""
-    return 1e-12 * sum(float(abs(part).sum()) for part in numbers)
+    return 2.0**-48 * sum(float(abs(part).sum()) for part in numbers)

@@ -23,11 +23,12 @@ def repair(problem: Constrained, x: Array) -> Array:
         problem: One problem, or several.
         x: States in {0, 1}, ``(*problems, n_states, n)``.
     """
-    rows, state = problem.constraints, to_numpy(x) > 0.5
+    rows, every = problem.constraints, to_numpy(x) > 0.5
     order, ends = grouped(rows.variables, problem.n)
     around = _Neighbours(problem)
-    row = rows.row
-    while True:
+    row, moving = rows.row, np.arange(every.shape[-2])
+    while moving.size:
+        state = every[..., moving, :]
         sums = rows.sums(state)
         change = np.where(state[..., rows.variables], -rows.coefficients, rows.coefficients)
         before = rows.excess(sums)[..., row]
@@ -39,10 +40,10 @@ def repair(problem: Constrained, x: Array) -> Array:
         mends = (broken < 0) | ((broken == 0) & (excess < 0))
         lowers = (broken == 0) & (excess == 0) & (costs < -_rounding(costs))
         good = mends | lowers
-        if not good.any():
-            return cast(alike(np.ascontiguousarray(state), x), x.dtype)
         price = np.where(mends, costs / np.maximum(-broken, 1), costs)
-        state = state ^ (good & around.first(np.lexsort((price, ~mends, ~good))))
+        every[..., moving, :] ^= good & around.first(np.lexsort((price, ~mends, ~good)))
+        moving = moving[good.any(-1).reshape(-1, len(moving)).any(0)]
+    return cast(alike(every, x), x.dtype)
 
 
 def _rounding(costs: NDArray[Any]) -> float:

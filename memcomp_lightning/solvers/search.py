@@ -28,7 +28,7 @@ from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.solvers.found import PROVEN, Found, State
 from memcomp_lightning.solvers.proofs import RoofDual, eliminated, parts_of, roof_dual, rounding
 from memcomp_lightning.solvers.solving import Given, constrained_of, minimise, numbers_of
-from memcomp_lightning.solvers.tabu import TabuSearch
+from memcomp_lightning.solvers.tabu import MOST, TabuSearch
 
 Bits = NDArray[np.bool_]
 
@@ -42,7 +42,8 @@ class Search:
     once is: graphs of treewidth two, and what roof duality decides.
 
     Attributes:
-        time_limit: Seconds, > 0, those of compilation not counted; None is no limit.
+        time_limit: Seconds, > 0, those of compilation not counted; None is no limit. Annealing, crossover and tabu
+            search end in time; other solvers end the round that they are in.
         target: The search ends at this energy or below; None is no target.
         n_solutions: Most distinct states to keep, >= 1. Where restarts find fewer, short tabu searches add theirs.
         min_distance: Number of variables in which any two of these states differ at least, >= 1.
@@ -134,7 +135,7 @@ def _longer(solver: QuboSolver, factor: float, steps: int) -> QuboSolver:
         return solver
     value = getattr(solver, name)
     length = factor * (steps if value is None else value)
-    settings = {name: length if isinstance(value, float) else max(1, round(length))}
+    settings = {name: length if isinstance(value, float) else min(max(1, round(length)), MOST - 1)}
     if isinstance(solver, DmmSolver):
         settings["record"] = None  # the first round's is drawn
     return replace(solver, **settings)
@@ -149,7 +150,7 @@ class _Record:
         self._given = given = numbers_of(problem)
         self._qubo = None if isinstance(given, WeightedMaxSat) and given.longer else as_qubo(given)
         self._unit = unit_of(problem)
-        self._noise = 10 * rounding(parts_of(given)) if self._unit is None else 0.0
+        self._noise = 10 * rounding(parts_of(given)) if self._unit is None else 0
         self._resolution = 0.75 * self._unit if self._unit else self._noise
         self._curve, self._lower_bound = list[tuple[float, Exact | float]](), -math.inf
         self._energies, self._status, self._steps = list[Exact | float | None](), list[Status](), list[int]()

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from memcomp_lightning.rng import Generator
 
 
+MOST = 2**29
+"""Bound of steps, tenure and patience: the kernel counts in 32 bits."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TabuSearch:
     """Solve QUBOs by one-flip tabu search (Glover, Kochenberger & Alidaee 1998), in whole numbers.
@@ -64,6 +68,7 @@ class TabuSearch:
         for name, smallest in (("n_steps", 1), ("tenure", 0), ("patience", 1)):
             if getattr(self, name) is not None:
                 require_count(name, getattr(self, name), smallest)
+                require(getattr(self, name) < MOST, name, getattr(self, name), f"an integer below {MOST}")
         require(0 < self.kick <= 1, "kick", self.kick, "a number in (0, 1]")
         check_kernel(self.kernel)
 

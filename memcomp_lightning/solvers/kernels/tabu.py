@@ -10,6 +10,7 @@ LARGEST = 2**30
 """More than any change of the energy: the couplings of a variable are scaled to add up to less than half."""
 
 _FORBIDDEN = np.int32(LARGEST)
+_ALWAYS = np.int32(2**31 - 1)
 
 
 @njit(nogil=True, cache=True)
@@ -60,7 +61,7 @@ def search(first_item, last_item, stop, problem, own, n_steps, settings, seeds, 
             if stop[0]:
                 break
             of_all, of_free = _smallest(change, free_from, step)
-            wanted, latest = (of_all, _FORBIDDEN) if energy + of_all < lowest else (of_free, np.int32(step))
+            wanted, latest = (of_all, _ALWAYS) if energy + of_all < lowest else (of_free, np.int32(step))
             if wanted == _FORBIDDEN:
                 i = random.below(state, n)
             else:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.problems import Bipartite, Qubo
 from memcomp_lightning.rng import numpy_stream
-from memcomp_lightning.solvers import BranchAndBound, BruteForce, Portfolio, Status
+from memcomp_lightning.solvers import BranchAndBound, BruteForce, Portfolio, Status, TabuSearch
 
 
 def layers(generator):
@@ -54,3 +55,16 @@ def test_populations_of_trials_and_of_the_rest_differ():
     assert sizes.sum() == 28
     assert sizes.max() <= 14
     assert (sizes == 1).sum() >= 3
+
+
+def test_whole_numbers_in_two_layers_are_solved():
+    numbers = numpy_stream(0, "whole").integers(-9, 10, (20, 5))
+    whole = Qubo(Bipartite(5, 20), numbers, np.arange(25) - 12, np.array(0))
+    minimum = BranchAndBound().minimise(whole.double(), generator=numpy_stream(0, "proof")).best_energy
+    assert Portfolio().minimise(whole, generator=numpy_stream(0, "solver")).best_energy == minimum
+
+
+@pytest.mark.parametrize("name", ["n_steps", "tenure", "patience"])
+def test_more_than_the_kernel_counts_is_refused(name):
+    with pytest.raises(SettingError, match=f"{name} = {2**30}"):
+        TabuSearch(**{name: 2**30})

@@ -79,7 +79,7 @@ def test_regions_that_are_not_coupled_are_solved_each_by_itself():
     [
         CrossoverAnnealing(n_sweeps=10**6),
         GibbsAnnealing(n_sweeps=10**8),
-        TabuSearch(n_steps=10**9),
+        TabuSearch(n_steps=2**29 - 1),
     ],
     ids=lambda solver: type(solver).__name__,
 )

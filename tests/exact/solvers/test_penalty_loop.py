@@ -1,6 +1,7 @@
 """Constraints by solvers that know none: against enumeration, and what a repair may not do."""
 
 import random
+import time
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from memcomp_lightning.solvers import (
     GibbsAnnealing,
     PenaltyLoop,
     Portfolio,
+    Search,
     Status,
     TabuSearch,
 )
@@ -256,3 +258,26 @@ def test_no_constraints_and_long_clauses():
 def test_refusals(settings, message):
     with pytest.raises(SettingError, match=message):
         PenaltyLoop(**settings)
+
+
+def test_it_ends_in_time_with_an_answer_that_keeps_the_constraints():
+    generator = rng.numpy_stream(0, "dense")
+    n = 200
+    problem = Constrained.of(Qubo.from_matrix(generator.normal(size=(n, n))), [exactly(20, range(n))])
+    begin = time.perf_counter()
+    found = Search(time_limit=0.3).run(problem, Portfolio())
+    assert time.perf_counter() - begin < 20  # a hundred times as long without the limit
+    assert found.states[0].n_broken == 0
+
+
+def test_rows_that_no_state_breaks_cost_nothing():
+    free = Constrained.of(Qubo.from_matrix(np.eye(20)), [Linear(dict.fromkeys(range(20), 1), 0, 20)])
+    given = free.penalised(np.ones(1))
+    assert (given.n, len(given.graph.edges())) == (20, 0)
+
+
+def test_a_proof_that_nothing_is_feasible_is_not_lost():
+    none = Constrained.of(
+        Qubo.from_matrix(np.zeros((3, 3))), [exactly(3, range(3)), *(exactly(0, [i]) for i in range(3))]
+    )
+    assert Search().run(none, BruteForce()).conclusion is Status.INFEASIBLE

@@ -1,5 +1,6 @@
 """Rounds of a solver: when they end, what is kept of them, and what they say together."""
 
+import itertools
 import math
 import signal
 import threading
@@ -25,7 +26,7 @@ from memcomp_lightning.solvers import (
     search,
 )
 from memcomp_lightning.solvers.dmm import DmmSolver, Recording
-from memcomp_lightning.solvers.found import Found, State
+from memcomp_lightning.solvers.found import PROVEN, Found, State
 
 
 def dense(n, name="dense"):
@@ -184,7 +185,7 @@ def test_ctrl_c_returns_the_best_so_far():
         Search().run(glass(14), Interrupted(1))
 
 
-ENDLESS = [TabuSearch(n_steps=10**12), GibbsAnnealing(n_sweeps=10**7), Portfolio(effort=1e3)]
+ENDLESS = [TabuSearch(n_steps=2**29 - 1), GibbsAnnealing(n_sweeps=10**7), Portfolio(effort=1e3)]
 
 
 @pytest.mark.parametrize("solver", ENDLESS, ids=lambda solver: type(solver).__name__)
@@ -367,3 +368,22 @@ def test_memory_that_runs_out_is_said():
 
     with pytest.raises(UserError, match=r"^14 variables, 91 couplings. Hungry with solver.n_restarts = 7 needs"):
         Search().run(ONES, Hungry())
+
+
+def test_a_large_number_makes_no_proof_and_no_agreement():
+    generator = rng.numpy_stream(0, "large")
+    matrix = generator.normal(size=(20, 20))
+    matrix[0, 0] = 5e12
+    qubo = Qubo.from_matrix(matrix)
+    minimum = BruteForce().minimise(qubo, generator=generator).best_energy
+    found = Search().run(qubo, TabuSearch(n_restarts=1, n_steps=1))
+    assert found.states[0].energy > minimum + 1
+    assert found.conclusion not in PROVEN
+
+
+def test_the_curve_of_decimal_fractions_falls(tmp_path):
+    lines = [f"{i} {j} 0.1" for i in range(18) for j in range(i)] + [f"{i} {i} -0.3" for i in range(18)]
+    (tmp_path / "decimal.coo").write_text("\n".join(lines))
+    found = Search(n_solutions=4).run(read_problem(tmp_path / "decimal.coo"), Portfolio())
+    energies = [energy for _, energy in found.curve]
+    assert all(after < before for before, after in itertools.pairwise(energies))
