@@ -111,7 +111,7 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
         say(f"{len(tasks) - len(todo)} of {len(tasks)} answers are in {short_path(table.absolute())} already.")
     of_tasks = [task.row for task in tasks]
     label = dict(zip(map(solve_table.key, of_tasks), solve_table.labels(of_tasks), strict=True))
-    order = list(dict.fromkeys([*rows, *label]))
+    order = list(dict.fromkeys([*label, *rows]))
     values = {seen_from(table, file): value for file, value in known.items()}
 
     def written() -> list[Row]:

@@ -75,7 +75,7 @@ def tasks_of(file: Path, combinations: Sequence[Combination], table: Path, folde
         settled = {setting: value for setting, value in config.items() if setting != "problem"}
         if settled.get("initial") is not None:
             settled["initial"] = _content(Path(str(settled["initial"])).expanduser())
-        made_of = json.dumps([content, settled, __version__], sort_keys=True, default=str)
+        made_of = json.dumps([content, seen_from(table, file), settled, __version__], sort_keys=True, default=str)
         fingerprint = hashlib.sha256(made_of.encode()).hexdigest()[:16]
         solution = folder / f"{name}.{solver}.{config['seed']}.{fingerprint[:6]}.json"
         row = dict.fromkeys(COLUMNS, "") | {

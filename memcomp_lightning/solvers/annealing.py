@@ -81,22 +81,16 @@ class GibbsAnnealing:
         """The first sweep after which a copy descends."""
         return math.ceil(_HOT * self.n_sweeps)
 
-    def _betas(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """Inverse temperatures in units of 1 / s."""
-        growth = self.beta_last / self.beta_first
-        return self.beta_first * np.logspace(0, 1, self.n_sweeps, base=growth)
-
     def _reference(self, qubo: Qubo, generator: "Generator") -> Array:
         """Plain operations on arrays."""
         xp, x, best = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator), None
         scale = scale_of(qubo)
-        for number, beta in enumerate(self._betas().tolist()):
+        for number, beta in enumerate(geometric(self.beta_first, self.beta_last, self.n_sweeps).tolist()):
             sweep(qubo, x, beta / scale, generator)
             late = number - self._quench_from
             if number + 1 == self.n_sweeps or (late >= 0 and late % self.quench_every == 0):
                 found = xp.asarray(x, copy=True)
-                for _ in range(_DESCENTS):
-                    descend(qubo, found)
+                descend_far(qubo, found)
                 energies = qubo.energy(found)
                 if best is None:
                     best, lowest = found, energies
@@ -115,7 +109,8 @@ class GibbsAnnealing:
         n_items = n_problems * -(-self.n_restarts // width)
         own_seeds = seeds(n_items, generator)
         unit = power_of_two(problem.couplings, problem.own)
-        betas = float32(self._betas() * (unit / to_numpy(scale_of(qubo)).ravel())[:, None])
+        betas = geometric(self.beta_first, self.beta_last, self.n_sweeps)
+        betas = float32(betas * (unit / to_numpy(scale_of(qubo)).ravel())[:, None])
         best = np.full((n_items, qubo.n, width), -1, np.int8)
         kernel = annealing.anneal_layers if layered else annealing.anneal_pairs
         longest = qubo.n if layered else width
@@ -134,7 +129,18 @@ _HOT = 0.3
 """Share of the schedule before the first descent: so early none leads far down."""
 
 _DESCENTS = 4
-"""Sweeps of a descent of the reference: what is left changes little."""
+"""Sweeps of a descent of the reference."""
+
+
+def geometric(first: float, last: float, n: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Inverse temperatures from the first to the last, each the same multiple of the one before."""
+    return first * np.logspace(0, 1, n, base=last / first)
+
+
+def descend_far(qubo: Qubo, x: Array) -> None:
+    """Descend for so long that what is left changes little, in place."""
+    for _ in range(_DESCENTS):
+        descend(qubo, x)
 
 
 def sweep(qubo: Qubo, x: Array, beta: Array, generator: "Generator") -> None:

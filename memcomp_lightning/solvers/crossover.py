@@ -11,8 +11,8 @@ from memcomp_lightning import compiling, rng
 from memcomp_lightning.arrays import Array, add_up, alike, cast, double, namespace, to_numpy
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
-from memcomp_lightning.solvers.alternating_descent import descend, random_states
-from memcomp_lightning.solvers.annealing import scale_of, sweep
+from memcomp_lightning.solvers.alternating_descent import random_states
+from memcomp_lightning.solvers.annealing import descend_far, geometric, scale_of, sweep
 from memcomp_lightning.solvers.base import QuboSolution
 from memcomp_lightning.solvers.compiled import (
     check_kernel,
@@ -95,28 +95,24 @@ class CrossoverAnnealing:
         """Sweeps of a round."""
         return max(1, self.n_sweeps // 10)
 
-    def _betas(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """Inverse temperatures of the first annealing in units of 1 / s."""
-        return self.beta_first * np.logspace(0, 1, self.n_sweeps, base=self.beta_last / self.beta_first)
-
     def _reference(self, qubo: Qubo, generator: "Generator") -> Array:
         """Plain operations on arrays; all states of a problem are one population."""
         xp, kept, scale = namespace(qubo.linear), random_states(qubo, self.n_restarts, generator), scale_of(qubo)
-        for beta in self._betas().tolist():
+        for beta in geometric(self.beta_first, self.beta_last, self.n_sweeps).tolist():
             sweep(qubo, kept, beta / scale, generator)
-        _descend(qubo, kept)
+        descend_far(qubo, kept)
         for number in range(1, self.n_rounds + 1):
             x, u = xp.asarray(kept, copy=True), rng.uniform((), generator=generator, like=scale)
             first = self.reheat_first * (self.reheat_last / self.reheat_first) ** float(u)
             for step in range(self._n_short):
                 beta = first + (self.beta_last - first) * step / self._n_short
                 sweep(qubo, x, beta / scale, generator)
-            _descend(qubo, x)
+            descend_far(qubo, x)
             kept = _cross(qubo, kept, x)
             if number % _CROSS_EVERY == 0 and self.n_restarts > 1:
                 shift = 1 + int(rng.integers(self.n_restarts - 1, (), generator=generator, like=scale))
                 kept = _cross(qubo, kept, xp.roll(kept, shift, axis=-2))
-            _descend(qubo, kept)
+            descend_far(qubo, kept)
         return kept
 
     def _compiled(self, qubo: Qubo, generator: "Generator") -> tuple[Array, Array, bool]:
@@ -133,7 +129,10 @@ class CrossoverAnnealing:
         best = np.full((len(own_seeds), qubo.n, annealing.LANES), -1, np.int8)
         numbers = (*problem.rows(lambda part: over(part, unit)), over(problem.own, unit))
         n_sweeps = self.n_sweeps + self.n_rounds * self._n_short
-        betas, pool = float32(self._betas() * over_scale), random.thresholds(annealing.LANES)
+        betas, pool = (
+            float32(geometric(self.beta_first, self.beta_last, self.n_sweeps) * over_scale),
+            random.thresholds(annealing.LANES),
+        )
         arguments = (numbers, betas, reheat, rounds, pool, own_seeds, best)
         work = best.size * n_sweeps * max(1, problem.size // max(qubo.n, 1)) / 10
         in_time = share(crossover.evolve, len(own_seeds), work, arguments, (annealing, random), anytime=True)
@@ -144,15 +143,6 @@ class CrossoverAnnealing:
 
 _CROSS_EVERY = 3
 """Rounds from one crossing of the states with one another to the next: at each one they become alike too soon."""
-
-_DESCENTS = 4
-"""Sweeps of a descent of the reference: what is left changes little."""
-
-
-def _descend(qubo: Qubo, x: Array) -> None:
-    """Descend in place."""
-    for _ in range(_DESCENTS):
-        descend(qubo, x)
 
 
 def _cross(qubo: Qubo, x: Array, other: Array) -> Array:
