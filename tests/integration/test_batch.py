@@ -115,12 +115,13 @@ def test_what_is_done_is_not_done_again(memcomp_solve: Solve) -> None:
     again = memcomp_solve("batch", *descent)
     assert "1 of 3 answers are in results.csv already." in again.out
     assert "[2/2]" in again.out
-    assert rows()[0] | {"gap": ""} == first | {"gap": ""}, "the row is as it was"
+    (same,) = (row for row in rows() if row["file"] == first["file"])
+    assert same | {"gap": ""} == first | {"gap": ""}, "the row is as it was"
     assert "3 of 3 answers" in memcomp_solve("batch", *descent).out
     Path("batch/ring.txt").write_text(RING.replace(" 1\n", " 3\n"))
     changed = memcomp_solve("batch", *descent)
     assert "2 of 3 answers" in changed.out, "a file with other contents is another problem"
-    assert [row["value"] for row in rows()] == ["12", "-10", "2"]
+    assert sorted(row["value"] for row in rows()) == ["-10", "12", "2"]
 
 
 def test_a_file_that_cannot_be_read_costs_its_own_row(memcomp_solve: Solve) -> None:
