@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.errors import require_choice, require_parts
+from memcomp_lightning.errors import require, require_choice, require_count, require_parts
 from memcomp_lightning.problems.files.numbers import Exact
 from memcomp_lightning.problems.labelled import Labelled
 from memcomp_lightning.problems.problem import Problem
@@ -91,7 +91,8 @@ def solve(
             A ``Qubo``, ``WeightedMaxSat`` or ``Constrained``.
         solver: A key of :data:`SOLVERS`, or a solver with settings, such as ``TabuSearch(n_restarts=100)``.
         seed: Of the random stream. The same seed gives the same answer, if there is no time limit.
-        time_limit: Seconds, > 0, those of compilation not counted; None is one call of the solver.
+        time_limit: Seconds, > 0, those of compilation not counted; None is one call of the solver. Annealing,
+            crossover and tabu search end in time; other solvers end the round that they are in.
         target: Stop at this energy or below; of a cut or a file, at this objective or better. Without a time limit
             the search goes on until then.
         initial: A state, or a list of states, to begin with, written as ``best`` is.
@@ -105,6 +106,8 @@ def solve(
     >>> solve({("a", "a"): 1, ("a", "b"): -3, ("b", "b"): 1}).best
     {'a': 1, 'b': 1}
     """
+    require_count("seed", seed, 0)
+    require(callback is None or callable(callback), "callback", callback, "a function of a state, or None")
     labelled, chosen = Labelled.of(problem), solver_of(solver)
     search = Search(
         time_limit=time_limit,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -200,6 +201,12 @@ class Constrained:
         Raises:
             SettingError: A constraint names a variable that there is not, or a number that is not whole.
         """
+        allowed = "a Qubo or WeightedMaxSat", "Linear(...), exactly(...) or clause(...)"
+        require(isinstance(objective, Qubo | WeightedMaxSat), "objective", type(objective).__name__, allowed[0])
+        for constraint in constraints:
+            require(isinstance(constraint, Linear), "constraint", constraint, allowed[1])
+            whole = all(isinstance(variable, Integral) for variable in constraint.coefficients)
+            require(whole, "variables of a constraint", list(constraint.coefficients), "integers from 0 to n - 1")
         return Constrained(objective, Constraints.of(objective.n, constraints))
 
     @property

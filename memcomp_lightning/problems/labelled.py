@@ -52,10 +52,11 @@ class Labelled:
         if isinstance(given, str | Path):
             given = read_problem(given)
         if isinstance(given, Problem):
-            return Labelled(problem=given, maximised=given.objective.maximised)
+            of_spins = getattr(given.objective.counting, "kind", None) == "spin"
+            return Labelled(problem=given, spins=of_spins, maximised=given.objective.maximised)
         if isinstance(given, Constrained | Qubo | WeightedMaxSat):
             return Labelled(problem=given)
-        if isinstance(given, Mapping):
+        if isinstance(given, Mapping) and not hasattr(given, "tocoo"):  # scipy's dok arrays are both
             return _of_pairs("product", {}, given)
         if isinstance(given, tuple) and len(given) == 2:
             return _of_spins(*given)
@@ -160,6 +161,7 @@ def _of_matrix(matrix: Any) -> Qubo:
     """``x' Q x`` of a square matrix of any library."""
     tensor = hasattr(matrix, "detach")
     known = isinstance(matrix, np.ndarray) or hasattr(matrix, "tocoo") or tensor
+    matrix = np.asarray(matrix) if isinstance(matrix, np.matrix) else matrix
     require(known, "problem", type(matrix).__name__, TAKEN)
     shape = tuple(matrix.shape)
     square = len(shape) == 2 and shape[0] == shape[1] > 0

@@ -74,13 +74,18 @@ class Qubo:
         return offset[..., None] + own + self.graph.quadratic(coupling, x)
 
     def rounds(self) -> Array:
-        """Whether the numbers are integers with sums beyond 2^53, which float64 rounds: ``(*problems,)`` bool."""
+        """Whether float64 rounds sums of these numbers by as much as the smallest of them: ``(*problems,)`` bool.
+
+        Sums of integers are exact up to 2^53, those of others rounded by 2^-53 of what they reach.
+        """
         xp = namespace(self.linear)
         if self.linear.dtype == xp.int64:
             return xp.zeros_like(self.offset, dtype=xp.bool)
         parts = [self.coupling.reshape(*self.problems, -1), self.linear, self.offset[..., None]]
         numbers = xp.concat([double(part) for part in parts], axis=-1)
-        return (numbers == xp.round(numbers)).all(-1) & (abs(numbers).sum(-1) > 2.0**53)
+        whole, total = (numbers == xp.round(numbers)).all(-1), abs(numbers).sum(-1)
+        smallest = xp.min(xp.where(numbers == 0, xp.inf, abs(numbers)), axis=-1)
+        return xp.where(whole, total > 2.0**53, total * 2.0**-50 > smallest)
 
     def field(self, x: Array) -> Array:
         """Energy of x_i = 1 less energy of x_i = 0 for each variable, ``(*problems, n_states, n)``."""

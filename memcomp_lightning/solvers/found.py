@@ -100,6 +100,8 @@ class Found:
                 return Status.OPTIMAL
             if self.agree:
                 return Status.AGREED
+        if self.states[0].n_broken:
+            return Status.NOT_FEASIBLE
         return ends[0] if ends else Status.STEP_BUDGET
 
     def _best(self) -> list[int]:

@@ -13,7 +13,7 @@ import torch
 
 from memcomp_lightning import rng, solve
 from memcomp_lightning.errors import SettingError, UserError
-from memcomp_lightning.problems import ProblemFileError, Qubo, WeightedMaxSat, read_problem
+from memcomp_lightning.problems import Constrained, Linear, ProblemFileError, Qubo, WeightedMaxSat, read_problem
 from memcomp_lightning.solvers import AlternatingDescent, Portfolio, Status, TabuSearch
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.testing import small_rbm
@@ -94,7 +94,7 @@ def of_file():
     matrix = np.tril(NUMBERS).round(3)
     own = matrix.diagonal().copy()
     np.fill_diagonal(matrix, 0)
-    return "spins.coo", lambda x: ising(own, matrix)(2 * x - 1), None
+    return "spins.coo", ising(own, matrix), None
 
 
 def of_clauses():
@@ -142,6 +142,7 @@ KINDS = {
     "clauses": of_clauses,
 }
 OF_SPINS = ("spins by label", "spins and a matrix", "spins and a sparse matrix", "spins and pairs", "BQM of spins")
+OF_SPINS += ("file", "read file")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -307,3 +308,43 @@ def test_no_torch_without_tensors():
         "assert not {'torch', 'lightning', 'hydra'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "settings", "match"),
+    [
+        (np.eye(2), {"seed": "x"}, "seed = 'x'"),
+        (np.eye(2), {"seed": 1.5}, "seed = 1.5"),
+        (np.eye(2), {"callback": 3}, "callback = 3"),
+    ],
+)
+def test_settings_of_another_kind_are_refused(given, settings, match):
+    with pytest.raises(SettingError, match=match):
+        solve(given, **settings)
+
+
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
+def test_matrices_of_every_class_are_taken():
+    scipy_sparse = pytest.importorskip("scipy.sparse")
+    matrix = np.array([[-1.0, 2.0], [0.0, -3.0]])
+    for kind in (np.asmatrix, scipy_sparse.dok_array, scipy_sparse.lil_matrix, scipy_sparse.dia_array):
+        assert solve(kind(matrix)).best_energy == -3.0
+
+
+@pytest.mark.parametrize("solver", ["brute_force", "best"])
+def test_numbers_too_far_apart_for_float64_are_no_proof(solver):
+    assert solve(np.diag([-1e15, -0.01]), solver=solver).status is Status.ROUNDED
+
+
+def test_what_breaks_a_constraint_is_not_feasible_whatever_else_is_asked():
+    rows = [Linear({1: -3}, -1, -1), Linear({0: 1, 1: 1}, 1, None)]
+    none = Constrained.of(Qubo.from_matrix(np.diag([-4.0, -3.0])), rows)
+    for n_solutions in (1, 2):
+        assert solve(none, solver="tabu", n_solutions=n_solutions).status is Status.NOT_FEASIBLE
+
+
+def test_constraints_of_another_kind_are_refused():
+    with pytest.raises(SettingError, match="objective = 'ndarray'"):
+        Constrained.of(np.eye(2), [])
+    with pytest.raises(SettingError, match="constraint = 'x0"):
+        Constrained.of(Qubo.from_matrix(np.eye(2)), ["x0 == 1"])
