@@ -200,7 +200,8 @@ def test_without_an_extra_the_message_says_what_to_install(python: Path, tmp_pat
 def test_imports_without_extras(python: Path, tmp_path: Path) -> None:
     code = """
 import importlib, pkgutil, memcomp_lightning
-needs = ("problems.bqm", "solvers.dimod", "samplers.annealer", "interop.memcomp_sampler", "interop.qpu")
+needs = ("problems.bqm", "problems.cqm", "solvers.dimod", "samplers.annealer")
+needs += ("interop.memcomp_sampler", "interop.qpu")
 for module in pkgutil.walk_packages(memcomp_lightning.__path__, "memcomp_lightning."):
     if not module.name.endswith(needs):
         importlib.import_module(module.name)

@@ -60,7 +60,11 @@ SAMPLERS = ["cd", "pcd", "dmm_qubo", "mode_assisted_pcd"]
 @pytest.mark.usefixtures("no_pages")
 def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
     """One sampler of each kind; two lengths and two seeds in one tensor program, the last bits may differ."""
-    curves = [f"+figure.curves.{name}={{label: {name}, overrides: ['sampler={name}']}}" for name in SAMPLERS]
+    # Common settings of the solver are those of the DMM.
+    curves = [
+        f"+figure.curves.{name}={{label: {name}, overrides: ['sampler={name}', 'solver=dmm']}}"
+        for name in SAMPLERS
+    ]
     outcome = memcomp_train(
         "experiment=figure4",
         *SMALL,
@@ -77,6 +81,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
         single = memcomp_train(
             *SINGLE,
             f"sampler={name}",
+            "solver=dmm",
             "pretrain.iterations=3",
             "finetune.iterations=2",
             "seed=5",

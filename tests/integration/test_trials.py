@@ -50,7 +50,9 @@ CASES = [
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: " ".join(case)[:60])
 def test_a_loop_without_a_trainer_ends_with_the_weights_of_the_run(memcomp_train: Run, case: list[str]) -> None:
-    uses_dmm = not any(part in " ".join(case) for part in ("annealing", "descent", "exact", "boltzmann"))
+    uses_dmm = not any(
+        part in " ".join(case) for part in ("annealing", "descent", "exact", "boltzmann", "mode_assisted")
+    )
     # The case comes last but for what keeps it small: controls may choose.
     overrides = [*SMALL, *(DMM if uses_dmm else []), *case]
     if case[0].startswith("sampler=exact"):
