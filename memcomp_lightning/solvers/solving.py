@@ -72,6 +72,16 @@ def check_memory(problem: Given, solver: QuboSolver) -> None:
         require(n_bytes // every <= MOST_RECORDED, "solver.record.every", every, allowed, remedy)
     if memory_needed(given, solver) > _installed():
         raise UserError(_too_large(problem, solver))
+    constrained = constrained_of(problem)
+    if constrained is not None and not constrained.constraints.are_clauses:
+        lengths = constrained.constraints.lengths
+        n_pairs = int((lengths * (lengths - 1) // 2).sum())
+        if _BYTES_A_PAIR * n_pairs > _installed():
+            needed, installed = (f"{size / 2**30:.0f} GiB" for size in (_BYTES_A_PAIR * n_pairs, _installed()))
+            raise UserError(
+                f"Constraints of up to {lengths.max()} variables couple {n_pairs} pairs, which need about {needed} of "
+                f"memory, more than there is ({installed}): write them with fewer variables each."
+            )
 
 
 def memory_needed(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
@@ -83,6 +93,9 @@ def memory_needed(problem: Qubo | WeightedMaxSat, solver: QuboSolver) -> int:
     numbers = problem.n + pairs + sum(math.prod(block.variables.shape) for block in longer)
     return _NUMBERS_EACH * 8 * int(getattr(solver, "n_restarts", 1)) * numbers
 
+
+_BYTES_A_PAIR = 100
+"""Of a QUBO that is put together from the squares of sums."""
 
 _NUMBERS_EACH = 5
 """Of eight bytes, for a variable or a coupling of a restart; measured."""

@@ -13,7 +13,15 @@ import torch
 
 from memcomp_lightning import rng, solve
 from memcomp_lightning.errors import SettingError, UserError
-from memcomp_lightning.problems import Constrained, Linear, ProblemFileError, Qubo, WeightedMaxSat, read_problem
+from memcomp_lightning.problems import (
+    Constrained,
+    Linear,
+    ProblemFileError,
+    Qubo,
+    WeightedMaxSat,
+    exactly,
+    read_problem,
+)
 from memcomp_lightning.solvers import AlternatingDescent, Portfolio, Status, TabuSearch
 from memcomp_lightning.solvers.dmm import DmmSolver
 from memcomp_lightning.testing import small_rbm
@@ -341,6 +349,13 @@ def test_what_breaks_a_constraint_is_not_feasible_whatever_else_is_asked():
     none = Constrained.of(Qubo.from_matrix(np.diag([-4.0, -3.0])), rows)
     for n_solutions in (1, 2):
         assert solve(none, solver="tabu", n_solutions=n_solutions).status is Status.NOT_FEASIBLE
+
+
+def test_constraints_that_memory_cannot_hold_are_refused_before_they_are_written():
+    n = 200_000
+    nothing = Qubo.from_coo(n, np.arange(n), np.arange(n), np.ones(n))
+    with pytest.raises(UserError, match="Constraints of up to 200000 variables couple 19999900000 pairs"):
+        solve(Constrained.of(nothing, [exactly(1, range(n))]))
 
 
 def test_constraints_of_another_kind_are_refused():
