@@ -79,8 +79,8 @@ def check_memory(problem: Given, solver: QuboSolver) -> None:
         if _BYTES_A_PAIR * n_pairs > _installed():
             needed, installed = (f"{size / 2**30:.0f} GiB" for size in (_BYTES_A_PAIR * n_pairs, _installed()))
             raise UserError(
-                f"Constraints of up to {lengths.max()} variables couple {n_pairs} pairs, which need about {needed} "
-                f"of memory, more than there is ({installed}): write them with fewer variables each."
+                f"Constraints of up to {lengths.max()} variables couple {n_pairs} pairs, which need about "
+                f"{needed} of memory, more than there is ({installed}): write them with fewer variables each."
             )
 
 
