@@ -107,9 +107,7 @@ def with_gaps(rows: Sequence[Row], known: Mapping[str, str]) -> list[Row]:
     return [row | {"best_known": known.get(row["file"], ""), "gap": cell(row)} for row in rows]
 
 
-def curves(
-    rows: Sequence[Row], known: Mapping[str, str], folder: Path
-) -> dict[str, list[list[tuple[float, float]]]]:
+def curves(rows: Sequence[Row], known: Mapping[str, str], folder: Path) -> dict[str, list[Curve]]:
     """Seconds and gap of the answers by solver, on the way where their solutions in ``folder`` tell it."""
     compared = references(rows, known)
     found: dict[str, list[Curve]] = {}

@@ -15,6 +15,8 @@ from memcomp_lightning.solvers.alternating_descent import descend, random_states
 from memcomp_lightning.solvers.base import QuboSolution
 from memcomp_lightning.solvers.compiled import (
     Layers,
+    Neighbours,
+    Numbers,
     check_kernel,
     device_of,
     float32,
@@ -108,21 +110,16 @@ class GibbsAnnealing:
         width = 1 if layered else annealing.LANES
         n_items = n_problems * -(-self.n_restarts // width)
         own_seeds = seeds(n_items, generator)
-        unit = power_of_two(problem.couplings, problem.own)
-        betas = geometric(self.beta_first, self.beta_last, self.n_sweeps)
-        betas = float32(betas * (unit / to_numpy(scale_of(qubo)).ravel())[:, None])
+        numbers, over_scale = in_units(qubo, problem)
+        betas = float32(geometric(self.beta_first, self.beta_last, self.n_sweeps) * over_scale)
         best = np.full((n_items, qubo.n, width), -1, np.int8)
         kernel = annealing.anneal_layers if layered else annealing.anneal_pairs
         longest = qubo.n if layered else width
-        numbers = (*problem.rows(lambda part: over(part, unit)), over(problem.own, unit))
         quench = self._quench_from, self.quench_every
         work = n_items * self.n_sweeps * width * problem.size / 10
         arguments = (numbers, betas, quench, random.thresholds(longest), own_seeds, best)
         in_time = share(kernel, n_items, work, arguments, (random,), anytime=True)
-        lanes = best.reshape(n_problems, -1, qubo.n, width).transpose(0, 1, 3, 2)
-        states = lanes.reshape(n_problems, -1, qubo.n)[:, : self.n_restarts]
-        x = np.ascontiguousarray(states).reshape(*qubo.problems, self.n_restarts, qubo.n)
-        return cast(alike(x > 0, qubo.linear), qubo.linear.dtype), alike(x[..., 0] >= 0, qubo.linear), in_time
+        return *states_of(best, qubo, self.n_restarts), in_time
 
 
 _HOT = 0.3
@@ -130,6 +127,27 @@ _HOT = 0.3
 
 _DESCENTS = 4
 """Sweeps of a descent of the reference."""
+
+
+def in_units(qubo: Qubo, problem: Layers | Neighbours) -> tuple[tuple[Numbers, ...], Numbers]:
+    """What the kernels read, in units of a power of two, and the unit over the scale, ``(n_problems, 1)``."""
+    unit = power_of_two(problem.couplings, problem.own)
+    numbers = (*problem.rows(lambda part: over(part, unit)), over(problem.own, unit))
+    return numbers, (unit / to_numpy(scale_of(qubo)).ravel())[:, None]
+
+
+def states_of(best: Numbers, qubo: Qubo, n_restarts: int | None = None) -> tuple[Array, Array]:
+    """The states that the kernels wrote, and which of them were run.
+
+    Args:
+        best: ``(n_problems * n_blocks, n, width)``: 0 or 1, and -1 where no time was left.
+        qubo: The problems.
+        n_restarts: So many of each problem; None is all.
+    """
+    lanes = best.reshape(math.prod(qubo.problems), -1, *best.shape[1:]).transpose(0, 1, 3, 2)
+    states = lanes.reshape(len(lanes), -1, qubo.n)[:, :n_restarts]
+    x = np.ascontiguousarray(states).reshape(*qubo.problems, -1, qubo.n)
+    return cast(alike(x > 0, qubo.linear), qubo.linear.dtype), alike(x[..., 0] >= 0, qubo.linear)
 
 
 def geometric(first: float, last: float, n: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -122,14 +122,18 @@ def without_zeros(qubo: Qubo) -> Qubo:
     """Turn two layers with few couplings other than zero into a list of pairs, which is faster."""
     if not isinstance(qubo.graph, Bipartite):
         return qubo
-    sparse = listed(qubo)
-    return qubo if len(sparse.graph.edges()) > SPARSE * math.prod(qubo.graph.edge_shape) else sparse
+    used = _used(qubo)
+    return qubo if used.sum() > SPARSE * len(used) else listed(qubo, used)
 
 
-def listed(qubo: Qubo) -> Qubo:
-    """The problem with those couplings that are not zero as a list of pairs."""
-    flat = qubo.coupling.reshape(*qubo.problems, -1)
-    used = (flat != 0).reshape(math.prod(qubo.problems), -1).any(0)
+def _used(qubo: Qubo) -> Array:
+    """Which couplings are not zero in some problem, ``(n_pairs,)``."""
+    return (qubo.coupling != 0).reshape(math.prod(qubo.problems), -1).any(0)
+
+
+def listed(qubo: Qubo, used: Array | None = None) -> Qubo:
+    """The problem with the couplings that are used as a list of pairs; None are those that are not zero."""
+    flat, used = qubo.coupling.reshape(*qubo.problems, -1), _used(qubo) if used is None else used
     pairs = alike(qubo.graph.edges(), used)[used]
     return Qubo(EdgeList(n=qubo.n, pairs=pairs), flat[..., used], qubo.linear, qubo.offset)
 
@@ -260,10 +264,9 @@ def share(
         kernel(0, 0, stop, *arguments)  # compiles once, not on every thread
         if limit is not None:
             limit.until += compiling.seconds_spent() - before
+            left = limit.until - time.perf_counter()
     cuts = np.linspace(0, n_items, min(n_items, 4 * most) + 1).astype(int).tolist()
     jobs = [_pool(most).submit(kernel, a, b, stop, *arguments) for a, b in pairwise(cuts)]
-    if limit is not None:  # compilation has taken its time
-        left = limit.until - time.perf_counter()
     try:
         _, late = wait(jobs, None if left == math.inf else max(left, 0.0))
         stop[0] = 1

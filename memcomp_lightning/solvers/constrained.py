@@ -101,8 +101,8 @@ def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: 
     xp, was_run, limit = namespace(raw), solution.energies < namespace(raw).inf, limit_here()
     late = limit is not None and limit.is_past and not problem.objective.problems
     x = xp.asarray(raw, copy=True)
-    chosen = slice(int(solution.energies.argmin()), None) if late else slice(None)
-    chosen = slice(chosen.start, chosen.start + 1) if late else chosen
+    first = int(solution.energies.argmin()) if late else 0
+    chosen = slice(first, first + 1 if late else None)
     x[..., chosen, :] = repair(problem, raw[..., chosen, :])
     broken = xp.where(was_run, problem.n_broken(x), len(problem.constraints))
     energies = xp.where(was_run, problem.energy(x), xp.inf)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from memcomp_lightning import compiling, rng
-from memcomp_lightning.arrays import Array, add_up, alike, cast, double, namespace, to_numpy
+from memcomp_lightning.arrays import Array, add_up, alike, double, namespace, to_numpy
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.alternating_descent import random_states
-from memcomp_lightning.solvers.annealing import descend_far, geometric, scale_of, sweep
+from memcomp_lightning.solvers.annealing import descend_far, geometric, in_units, scale_of, states_of, sweep
 from memcomp_lightning.solvers.base import QuboSolution
 from memcomp_lightning.solvers.compiled import (
     check_kernel,
@@ -20,8 +20,6 @@ from memcomp_lightning.solvers.compiled import (
     float32,
     listed,
     obstacle,
-    over,
-    power_of_two,
     seeds,
     seen_from_variables,
     share,
@@ -85,8 +83,7 @@ class CrossoverAnnealing:
             (x, was_run, in_time), size = self._compiled(qubo, generator), LANES
         else:
             x, was_run, in_time, size = self._reference(qubo, generator), None, True, self.n_restarts
-        n_sweeps = self.n_sweeps + self.n_rounds * self._n_short
-        solution = solution_of(qubo, x, begin, steps=n_sweeps, was_run=was_run, in_time=in_time)
+        solution = solution_of(qubo, x, begin, steps=self._n_all, was_run=was_run, in_time=in_time)
         numbers = np.broadcast_to(np.arange(x.shape[-2]) // size, x.shape[:-1])
         return replace(solution, population=alike(numbers, solution.steps)).lowest(self.n_restarts)
 
@@ -94,6 +91,11 @@ class CrossoverAnnealing:
     def _n_short(self) -> int:
         """Sweeps of a round."""
         return max(1, self.n_sweeps // 10)
+
+    @property
+    def _n_all(self) -> int:
+        """Sweeps of the first annealing and of all rounds."""
+        return self.n_sweeps + self.n_rounds * self._n_short
 
     def _reference(self, qubo: Qubo, generator: "Generator") -> Array:
         """Plain operations on arrays; all states of a problem are one population."""
@@ -120,25 +122,17 @@ class CrossoverAnnealing:
         from memcomp_lightning.solvers.kernels import annealing, crossover, random
 
         problem = seen_from_variables(qubo)
-        n_problems, n_populations = len(problem.own), -(-self.n_restarts // annealing.LANES)
-        own_seeds = seeds(n_problems * n_populations, generator)
-        unit = power_of_two(problem.couplings, problem.own)
-        over_scale = (unit / to_numpy(scale_of(qubo)).ravel())[:, None]
+        n_populations = -(-self.n_restarts // annealing.LANES)
+        own_seeds = seeds(len(problem.own) * n_populations, generator)
+        numbers, over_scale = in_units(qubo, problem)
         reheat = float32(self.reheat_first * over_scale[:, 0]), np.float32(self.reheat_last / self.reheat_first)
         rounds = self.n_rounds, self._n_short, _CROSS_EVERY
         best = np.full((len(own_seeds), qubo.n, annealing.LANES), -1, np.int8)
-        numbers = (*problem.rows(lambda part: over(part, unit)), over(problem.own, unit))
-        n_sweeps = self.n_sweeps + self.n_rounds * self._n_short
-        betas, pool = (
-            float32(geometric(self.beta_first, self.beta_last, self.n_sweeps) * over_scale),
-            random.thresholds(annealing.LANES),
-        )
-        arguments = (numbers, betas, reheat, rounds, pool, own_seeds, best)
-        work = best.size * n_sweeps * max(1, problem.size // max(qubo.n, 1)) / 10
+        betas = float32(geometric(self.beta_first, self.beta_last, self.n_sweeps) * over_scale)
+        arguments = (numbers, betas, reheat, rounds, random.thresholds(annealing.LANES), own_seeds, best)
+        work = best.size * self._n_all * max(1, problem.size // max(qubo.n, 1)) / 10
         in_time = share(crossover.evolve, len(own_seeds), work, arguments, (annealing, random), anytime=True)
-        x = best.reshape(n_problems, n_populations, qubo.n, annealing.LANES).transpose(0, 1, 3, 2)
-        x = np.ascontiguousarray(x).reshape(*qubo.problems, -1, qubo.n)
-        return cast(alike(x > 0, qubo.linear), qubo.linear.dtype), alike(x[..., 0] >= 0, qubo.linear), in_time
+        return *states_of(best, qubo), in_time
 
 
 _CROSS_EVERY = 3

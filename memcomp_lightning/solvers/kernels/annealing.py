@@ -186,12 +186,7 @@ def anneal_pairs(first_item, last_item, stop, problem, betas, quench, thresholds
         p = item // n_blocks
         random.begin(state, seeds[item])
         pairs = (begins, neighbours, couplings[p])
-        for i in range(n):
-            field[i] = own[p, i]
-        for i in range(n):
-            for lane in range(LANES):
-                change[lane] = x[i, lane] = F32(random.draw(state) >> np.uint64(63))
-            spread(field, pairs, i, change)
+        start_lanes(x, field, pairs, own[p], change, state)
         lowest[:] = np.inf
         n_sweeps = betas.shape[1]
         for sweep in range(n_sweeps):
@@ -209,6 +204,17 @@ def anneal_pairs(first_item, last_item, stop, problem, betas, quench, thresholds
                             best[item, i, lane] = kept[i, lane] > F32(0)
             if is_last:
                 break
+
+
+@njit(nogil=True, cache=True, forceinline=True)
+def start_lanes(x, field, pairs, own, change, state):
+    """Draw random states, with their fields."""
+    for i in range(x.shape[0]):
+        field[i] = own[i]
+    for i in range(x.shape[0]):
+        for lane in range(LANES):
+            change[lane] = x[i, lane] = F32(random.draw(state) >> np.uint64(63))
+        spread(field, pairs, i, change)
 
 
 @njit(nogil=True, cache=True, forceinline=True, fastmath=FAST_MATH)

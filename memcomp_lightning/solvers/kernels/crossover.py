@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from memcomp_lightning.solvers.kernels import random
-from memcomp_lightning.solvers.kernels.annealing import LANES, quench_lanes, spread, sweep_lanes
+from memcomp_lightning.solvers.kernels.annealing import LANES, quench_lanes, start_lanes, sweep_lanes
 
 F32 = np.float32
 
@@ -40,12 +40,7 @@ def evolve(first_item, last_item, stop, problem, betas, reheat, rounds, threshol
         p = item // n_populations
         random.begin(state, seeds[item])
         pairs = (begins, neighbours, couplings[p])
-        for i in range(n):
-            kept_field[i] = own[p, i]
-        for i in range(n):
-            for lane in range(LANES):
-                change[lane] = kept[i, lane] = F32(random.draw(state) >> np.uint64(63))
-            spread(kept_field, pairs, i, change)
+        start_lanes(kept, kept_field, pairs, own[p], change, state)
         for beta in betas[p]:
             if stop[0]:
                 break
