@@ -14,8 +14,8 @@ class Configurations(NamedTuple):
     """Joint states of visible and hidden units.
 
     Attributes:
-        v: Visible units in [0, 1], ``(*replicas, n, n_visible)``.
-        h: Hidden units, samples or conditional means in [0, 1], ``(*replicas, n, n_hidden)``.
+        v: Visible units, ``(*replicas, n, n_visible)``.
+        h: Hidden units, samples or conditional means, ``(*replicas, n, n_hidden)``.
         weight: Unnormalised weights >= 0, ``(*replicas, n)``; None means uniform.
     """
 
@@ -46,13 +46,14 @@ class Batch(NamedTuple):
     """Images of one optimiser step, or one chunk of them when the step's images are too many at once.
 
     Attributes:
-        v: Intensities in [0, 1], ``(*replicas, n, n_visible)``.
+        v: Values of the visible units, for pictures intensities in [0, 1], ``(*replicas, n, n_visible)``.
         label: Class indices (int64), ``(*replicas, n)``.
         share: ``n_processes * n / n_step``, where ``n_step`` counts the images of the step over all its
             chunks and processes, each by its weight. The gradient of ``share * mean over this batch``, summed
             over the chunks and averaged over the processes, is the gradient of the mean over the step's images.
         closes_step: Whether the optimiser steps after this chunk.
         weight: How often each image counts, > 0, ``(*replicas, n)``; None means once.
+        observed: Where values of ``v`` are known, a mask of its shape; None is everywhere.
     """
 
     v: Tensor
@@ -60,3 +61,4 @@ class Batch(NamedTuple):
     share: float
     closes_step: bool
     weight: Tensor | None = None
+    observed: Tensor | None = None

@@ -8,8 +8,8 @@ from memcomp_lightning.likelihood.exact import (
     log_likelihood,
     log_likelihood_or_bound,
     log_partition_function,
-    log_pseudo_likelihood,
 )
+from memcomp_lightning.likelihood.pseudo import log_pseudo_likelihood
 
 __all__ = [
     "Ais",

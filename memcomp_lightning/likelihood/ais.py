@@ -1,27 +1,24 @@
 """Estimate log Z of models too large to be enumerated, by annealed importance sampling, from below and above."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Generator, Tensor
 from tqdm.auto import tqdm
 
-from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
 from memcomp_lightning.models.base import EnergyModel, Visible, as_two_layers
-from memcomp_lightning.models.init import mean_log_odds
+from memcomp_lightning.models.init import independent_bias
 from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor
 
-base_of = mean_log_odds
-"""Visible bias of the independent units that have the data's means, a base for AIS."""
+base_of = independent_bias
+"""Visible bias of the independent units that have the data's means, a base for AIS: ``base_of(v, model.visible)``."""
 
 
 class AisEstimate(NamedTuple):
@@ -79,7 +76,10 @@ class Ais(_Annealing):
 
     Annealed importance sampling from an RBM without couplings (Neal 2001; Salakhutdinov & Murray 2008):
 
-    .. math:: p_\beta(v) \propto exp((1 - \beta) b_0.v + \beta b.v) \prod_i (1 + exp(\beta (W v + c)_i))
+    .. math:: p_\beta(v) \propto \mu(v) exp((1 - \beta) b_0.v + \beta b.v + \sum_i A(\beta (W v + c)_i))
+
+    with the measure and the cumulant A of the units, log(1 + exp(f)) for those in {0, 1}. Real units keep their
+    precision along the way.
 
     A chain starts at an independent draw at beta = 0 and makes k Gibbs sweeps at each beta in between. The mean
     weight is Z / Z_0 without bias; log Z is therefore too low on average, and log p(v) too high.
@@ -123,8 +123,8 @@ class Ais(_Annealing):
         """
         base = _base(model, base)
         rbm, base = as_two_layers(model).rbm, base_on_first_class(model, base)
-        start = torch.sigmoid(base).unsqueeze(-2).expand(*rbm.replicas, self.n_chains, rbm.n_visible)
-        v = rng.bernoulli(start, generator=generator)
+        start = base.unsqueeze(-2).expand(*rbm.replicas, self.n_chains, rbm.n_visible)
+        v = rbm.visible.sample(start, generator=generator)
         log_w = _anneal(rbm, v, base, self._schedule(), self.k, generator, progress)
         return _summary(_log_z_of_base(rbm, base), log_w, 1)
 
@@ -146,7 +146,7 @@ class ReverseAis(_Annealing):
 
         Args:
             model: The RBM.
-            v: Samples of the model in {0, 1}, two or more a replica; each starts a chain.
+            v: Samples of the model, two or more a replica; each starts a chain.
             generator: Random stream.
             base: As that of ``Ais.estimate``.
             progress: Show a bar.
@@ -172,31 +172,15 @@ def _anneal(
     base = base.unsqueeze(-2)
     field = model.hidden_field(v)
     for beta, target in tqdm(list(pairwise(betas)), desc="annealing", disable=not progress):
-        log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double() + _softplus_gain(field, beta, target)
+        log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double()
+        log_w += model.hidden.cumulant_gain(field, beta, target)
         if target != betas[-1]:
             for _ in range(k):
-                h = _draw(field.mul_(target).sigmoid_(), generator)
-                v = _draw(model.visible_field(h).mul_(target).add_(base, alpha=1 - target).sigmoid_(), generator)
+                h = model.hidden.sample(field.mul_(target), generator=generator)
+                towards = model.visible_field(h).mul_(target).add_(base, alpha=1 - target)
+                v = model.visible.sample(towards, generator=generator)
                 field = model.hidden_field(v)
     return log_w
-
-
-def _softplus_gain(field: Tensor, beta: float, target: float) -> Tensor:
-    r"""Sum over the units of softplus(target x) - softplus(beta x), ``(*replicas, n_chains)`` float64.
-
-    From low to high a unit gains (high - low) max(x, 0) + log1p(sigmoid(-low |x|) expm1(-(high - low) |x|)): no
-    difference of large numbers, no overflow, the argument of log1p in [-1/2, 0].
-    """
-    low, high = min(beta, target), max(beta, target)
-    size = field.abs()
-    linear = (high - low) / 2 * (field.sum(-1).double() + size.sum(-1).double())
-    fall = size.mul(low - high).expm1_().mul_(size.mul_(-low).sigmoid_()).log1p_().sum(-1).double()
-    return (linear + fall) * (1 if target > beta else -1)
-
-
-def _draw(probability: Tensor, generator: Generator) -> Tensor:
-    """``rng.bernoulli``, with one pass and one tensor less."""
-    return rng.uniform(probability.shape, generator=generator, like=probability).lt_(probability)
 
 
 def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
@@ -209,8 +193,10 @@ def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
 
 
 def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
-    """Log of Z_0 = 2^n_hidden prod_j (1 + exp(b_0j)), ``(*replicas,)`` float64."""
-    return model.n_hidden * math.log(2) + F.softplus(base.double(), threshold=40.0).sum(-1)
+    """Log of Z_0 = prod_i exp(A(0)) prod_j exp(A(b_0j)), ``(*replicas,)`` float64."""
+    free = model.c.new_zeros(*model.replicas, 1, model.n_hidden, dtype=torch.float64)
+    of_hidden = model.hidden.cumulant(free).sum(-1)
+    return (of_hidden + model.visible.cumulant(base.double().unsqueeze(-2)).sum(-1)).squeeze(-1)
 
 
 def _base(model: EnergyModel, base: Tensor | None) -> Tensor:

@@ -6,11 +6,12 @@ import math
 import torch
 from torch import Tensor
 
-from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks, softplus
+from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks
 from memcomp_lightning.models.base import Block, EnergyModel, Images, PerReplica, PerState
+from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
+from memcomp_lightning.models.units import Units, all_states
 
 
 def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
@@ -24,17 +25,13 @@ def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
 @torch.no_grad()
 def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> PerReplica:
     """Log Z by enumerating all units outside the largest class."""
-    model = _double(model)
-    blocks = model.blocks()
-    largest = max(blocks, key=lambda block: len(block.units))
-    others = _without(torch.arange(model.n_units, device=model.b.device), largest.units)
-    _require_few(len(others), max_units)
+    model = double_of(model)
+    largest, others, kind = model.outside_largest_class()
+    _require_few(kind, max_units)
     rows = max(1, NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
     parts = []
-    for start in range(0, 2 ** len(others), rows):
-        states = binary_states(
-            len(others), start=start, stop=min(start + rows, 2 ** len(others)), like=model.b.detach()
-        )
+    for numbers in torch.arange(kind.n_states, device=model.b.device).split(rows):
+        states = kind.states(numbers, like=model.b.detach())
         x = states.new_zeros(*model.replicas, len(states), model.n_units)
         x[..., others] = states
         parts.append(_summed_over(model, largest, x).logsumexp(-1))
@@ -44,15 +41,16 @@ def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Per
 @torch.no_grad()
 def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> PerState:
     """Log of the sum over h of exp(-E(v, h)), by enumerating all hidden units outside their largest class."""
-    model = _double(model)
+    model = double_of(model)
     v = v.double().expand(*model.replicas, *v.shape[-2:])
     if model.n_hidden == 0:
         return -model.energy(v, v[..., :0])
     largest = max(hidden_blocks(model), key=lambda block: len(block.units))
     hidden = torch.arange(model.n_visible, model.n_units, device=v.device)
     others = _without(hidden, largest.units)
-    _require_few(len(others), max_units)
-    states = binary_states(len(others), like=v)
+    kind = model.hidden.select(others - model.n_visible)
+    _require_few(kind, max_units)
+    states = all_states(kind, v)
 
     def of_images(some: Tensor) -> Tensor:
         x = some.new_zeros(*some.shape[:-1], len(states), model.n_units)
@@ -73,11 +71,11 @@ def log_likelihood_bound(
     .. math:: \log p(v) \ge -E(v, \mu) + \sum_i H(\mu_i) - \log Z
 
     with the means :math:`\mu` of :func:`memcomp_lightning.models.mean_field` and their entropies H
-    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled. The images are in {0, 1}
-    and may be without replica axes. A log Z from AIS is too low on average, and the bound then too high.
+    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled. The images are values of the
+    visible units and may be without replica axes. A log Z from AIS is too low on average, and the bound then too high.
     """
     require_count("max_iterations", max_iterations)
-    model = _double(model)
+    model = double_of(model)
     v = v.double().expand(*model.replicas, *v.shape[-2:])
     found = []
     for some in v.split(10_000, dim=-2):
@@ -89,10 +87,11 @@ def log_likelihood_bound(
 def _summed_over(model: EnergyModel, block: Block, x: Tensor) -> Tensor:
     """Log of the sum of exp(-E) over the units of a block, which are 0 in x."""
     energy = model.energy(x[..., : model.n_visible], x[..., model.n_visible :])
-    return softplus(block.field(x)).sum(-1) - energy
+    return block.kind.cumulant(block.field(x)).sum(-1) - energy
 
 
-def _double(model: EnergyModel) -> EnergyModel:
+def double_of(model: EnergyModel) -> EnergyModel:
+    """The model in float64, a copy where it is not."""
     return model if model.b.dtype == torch.float64 else copy.deepcopy(model).double()
 
 
@@ -100,7 +99,8 @@ def _without(units: Tensor, some: Tensor) -> Tensor:
     return units[~torch.isin(units, some)]
 
 
-def _require_few(n_units: int, max_units: int) -> None:
+def _require_few(kind: Units, max_units: int) -> None:
+    n_units = log2_states(kind)
     allowed = f"at most max_units = {max_units}, because all their states are enumerated"
     remedy = "Use Ais if the machine has two classes of units; otherwise use a smaller machine."
     require(n_units <= max_units, "units outside the largest class", n_units, allowed, remedy)

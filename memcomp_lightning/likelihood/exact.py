@@ -1,4 +1,6 @@
-"""Exact likelihoods of models small enough to be enumerated, and pseudo-likelihoods, which need no log Z."""
+"""Exact likelihoods of models small enough to be enumerated."""
+
+import math
 
 import torch
 from torch import Generator, Tensor
@@ -6,18 +8,21 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.enumeration import binary_states, bits
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.likelihood.bits import in_bits
 from memcomp_lightning.likelihood.boltzmann import (
+    double_of,
     log_hidden_sum,
     log_likelihood_bound,
     log_partition_function_by_classes,
 )
-from memcomp_lightning.likelihood.layers import NUMBERS, enumerable, in_chunks, log_weights, softplus
+from memcomp_lightning.likelihood.layers import NUMBERS, enumerable, in_chunks, log_weights, require_finite
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible, as_two_layers
+from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
+from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible
+from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.observed import log_weight_of_hidden
 from memcomp_lightning.models.rbm import RBM
-
-MOST_HIDDEN = 16
-"""Hidden units of a Boltzmann machine that are enumerated for each image at most."""
+from memcomp_lightning.models.units import all_states
 
 
 @torch.no_grad()
@@ -28,7 +33,8 @@ def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress:
 
     over the states s of the smaller layer, with bias g, and the units i of the other one. Time grows as
     2^n_smaller n_other, about 5e9 such pairs a second and CPU thread. A Boltzmann machine of two classes of units
-    is taken as such an RBM (``two_layers``); of any other all units outside the largest class are enumerated.
+    is taken as such an RBM (``two_layers``), spins as bits; of any other machine, and of categorical and real units,
+    all units outside the largest class are enumerated, and that one is summed by its cumulants.
 
     Args:
         model: The model, of any dtype.
@@ -42,23 +48,29 @@ def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress:
     torch.Size([])
     """
     two_layers = model.two_layers()
-    if two_layers is None:
+    binary = None if two_layers is None else in_bits(two_layers.rbm)
+    if binary is None:
+        require_finite(model)
         return log_partition_function_by_classes(model, max_units)
-    layers = enumerable(two_layers.rbm, max_units)
-    return prefix_log_weights(layers, progress=progress).logsumexp(-1).reshape(model.replicas)
+    layers = enumerable(binary.rbm, max_units)
+    log_z = prefix_log_weights(layers, progress=progress).logsumexp(-1).reshape(model.replicas)
+    return log_z - binary.offset
 
 
 @torch.no_grad()
 def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 25) -> Visible:
     """Draw n >= 1 independent visible states a replica, by enumerating the smaller layer.
 
-    It may have up to ``max_units`` units, which is 1 to 32.
+    It may have up to ``max_units`` units, which is 1 to 32; up to 20 where units are categorical or real.
 
     Raises:
         SettingError: As :func:`log_partition_function`.
     """
     require_count("n", n)
-    layers = enumerable(model, max_units)
+    binary = in_bits(model)
+    if binary is None:
+        return _samples_by_cumulants(model, n, generator, min(max_units, 20))
+    layers = enumerable(binary.rbm, max_units)
     n_second = min(N_SECOND, layers.n_enumerated)
     prefix = _draw(prefix_log_weights(layers, n_second=n_second), n, generator=generator)
     second = binary_states(n_second, like=layers.weight)
@@ -67,10 +79,27 @@ def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 
     for part in prefix.split(rows, dim=-1):
         log_weight = log_weights(layers, bits(part, layers.n_enumerated - n_second, like=second), second)
         rest.append(_draw(log_weight, 1, generator=generator))
-    number = prefix * len(second) + torch.cat(rest, dim=1).squeeze(-1)
-    states = bits(number, layers.n_enumerated, like=model.b)
-    states = states.reshape(*model.replicas, n, layers.n_enumerated)
-    return rng.bernoulli(model.visible_mean(states), generator=generator) if layers.hidden_first else states
+    number = (prefix * len(second) + torch.cat(rest, dim=1).squeeze(-1)).reshape(*model.replicas, n)
+    # Spins are numbered as the bits that they are written in.
+    if layers.hidden_first:
+        return model.draw_visible(model.hidden.states(number, like=model.b), generator=generator)
+    return model.visible.states(number, like=model.b)
+
+
+def _samples_by_cumulants(model: RBM, n: int, generator: Generator, max_units: int) -> Tensor:
+    """Visible states by the free energies of all states of the smaller layer."""
+    require_finite(model)
+    require(model.n_enumerated <= max_units, "units to enumerate", model.n_enumerated, f"at most {max_units}")
+    wide, hidden_first = double_of(model), model.enumerates_hidden
+    layer = model.hidden if hidden_first else model.visible
+    rows = max(1, NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
+    log_weight = []
+    for numbers in torch.arange(layer.n_states, device=model.b.device).split(rows):
+        states = layer.states(numbers, like=wide.b).expand(*model.replicas, len(numbers), layer.n)
+        log_weight.append(-(wide.hidden_free_energy(states) if hidden_first else wide.free_energy(states)))
+    number = _draw(torch.cat(log_weight, dim=-1), n, generator=generator)
+    states = layer.states(number, like=model.b)
+    return model.draw_visible(states, generator=generator) if hidden_first else states
 
 
 def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
@@ -83,34 +112,52 @@ def _draw(log_weight: Tensor, n: int, *, generator: Generator) -> Tensor:
 
 
 @torch.no_grad()
-def log_likelihood(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
+def log_likelihood(
+    model: EnergyModel, v: Images, log_z: PerReplica, *, observed: Tensor | None = None
+) -> PerState:
     """Return log p(v) = -F(v) - log Z of each image, in nats and float64.
+
+    With ``observed``, a mask of the shape of v, it is log p(observed values): the missing ones are summed, and up to
+    16 hidden units are enumerated.
 
     In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
     their largest class: up to 16 of them. For more, see :func:`log_likelihood_bound`.
 
-    Images are in {0, 1}, ``(*replicas, n, n_visible)``, or without replica axes for the same images everywhere.
-    Log Z may be exact or estimated.
+    Images are values of the visible units, ``(*replicas, n, n_visible)``, or without replica axes for the same images
+    everywhere. Of real units it is the log of a density. Log Z may be exact or estimated.
 
     Raises:
-        SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
+        SettingError: v has values that the units do not take, or the wrong shape; too many hidden units would have to
+            be enumerated.
     """
-    v = _binary(model, v)
-    parameters = _of_rbm(model)
-    if parameters is None:
+    v = pure_values(model, v, observed)
+    if observed is not None:
+        return _log_sum_of_observed(model, v, observed) - log_z.double().unsqueeze(-1)
+    if not has_free_energy(model):
         return log_hidden_sum(model, v, max_units=MOST_HIDDEN) - log_z.double().unsqueeze(-1)
-    weight, b, c = parameters
+    wide = double_of(model)
 
     def minus_free_energy(rows: Tensor) -> Tensor:
-        field = rows @ weight.mT + c.unsqueeze(-2)
-        return softplus(field).sum(-1) + (rows @ b.unsqueeze(-1)).squeeze(-1)
+        return -wide.free_energy(rows)
 
     return in_chunks(minus_free_energy, v, model.n_visible + model.n_hidden) - log_z.double().unsqueeze(-1)
 
 
+def _log_sum_of_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> Tensor:
+    """Log of the sum over missing values and hidden states."""
+    n = log2_states(model.hidden)
+    require(n <= MOST_HIDDEN, "number of hidden units", n, f"at most {MOST_HIDDEN} where values are missing")
+    wide = double_of(model)
+    states = all_states(model.hidden, wide.b.detach())
+    states, observed = states.expand(*model.replicas, *states.shape), observed.expand(v.shape)
+    rows = max(1, NUMBERS // (len(states) * max(1, math.prod(model.replicas))))
+    parts = zip(v.double().split(rows, dim=-2), observed.split(rows, dim=-2), strict=True)
+    return torch.cat([log_weight_of_hidden(wide, *part, states).logsumexp(-1) for part in parts], dim=-1)
+
+
 def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
     """:func:`log_likelihood`, or :func:`log_likelihood_bound` of a machine with more than 16 hidden units."""
-    if model.n_hidden > MOST_HIDDEN and model.quadratic_form().pairs is not None:
+    if model.n_hidden > MOST_HIDDEN and not has_free_energy(model):
         return log_likelihood_bound(model, v, log_z)
     return log_likelihood(model, v, log_z)
 
@@ -125,9 +172,10 @@ def kl_divergence(model: EnergyModel, v: Images, log_z: PerReplica | None = None
     Images are those of :func:`log_likelihood`; without log Z, :func:`log_partition_function` enumerates.
 
     Raises:
-        SettingError: v is not binary or has the wrong shape; the smaller layer is too large to enumerate.
+        SettingError: v has values that the units do not take, or the wrong shape; the smaller layer is too large to enumerate.
     """
-    require_count("number of rows of v", _binary(model, v).shape[-2])
+    require(not model.visible.real, "visible units", type(model.visible).__name__, "units that are not real")
+    require_count("number of rows of v", pure_values(model, v).shape[-2])
     log_p = log_likelihood(model, v, log_partition_function(model) if log_z is None else log_z)
     n = v.shape[-2]
     log_shares = torch.stack([_log_shares(rows) for rows in v.reshape(-1, n, v.shape[-1])])
@@ -139,60 +187,3 @@ def _log_shares(rows: Tensor) -> Tensor:
     _, at, counts = torch.unique(rows, dim=0, return_inverse=True, return_counts=True)
     log_shares: Tensor = (counts[at].double() / len(rows)).log()
     return log_shares
-
-
-@torch.no_grad()
-def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Visible:
-    r"""Return log p(v_j | all other v) of each unit j of each image in float64; needs no log Z.
-
-    .. math:: log p(v_j | v_{-j}) = -softplus(F(v) - F(v'))
-
-    where v' is v with unit j flipped. (Besag 1975.) In an RBM its hidden field differs from that of v by one
-    column of W; in a Boltzmann machine the hidden units, up to 16 outside their largest class, are enumerated.
-    The images are those of :func:`log_likelihood`; the log pseudo-likelihood of one is the sum over the last axis.
-
-    Raises:
-        SettingError: v is not binary or has the wrong shape; too many hidden units would have to be enumerated.
-    """
-    v = _binary(model, v)
-    parameters = _of_rbm(model)
-    if parameters is None:
-        flips = torch.eye(model.n_visible, dtype=torch.float64, device=v.device)
-
-        def of_images(rows: Tensor) -> Tensor:
-            flipped = (rows.unsqueeze(-2) - flips).abs()
-            log_sums = log_hidden_sum(model, flipped.flatten(-3, -2), max_units=MOST_HIDDEN)
-            log_sum = log_hidden_sum(model, rows, max_units=MOST_HIDDEN).unsqueeze(-1)
-            return -softplus(log_sums.unflatten(-1, flipped.shape[-3:-1]) - log_sum)
-
-        return in_chunks(of_images, v, model.n_visible * model.n_units)
-    weight, b, c = parameters
-
-    def of_rows(rows: Tensor) -> Tensor:
-        field = rows @ weight.mT + c.unsqueeze(-2)
-        change = 1 - 2 * rows
-        flipped = change.unsqueeze(-1) * weight.mT.unsqueeze(-3) + field.unsqueeze(-2)
-        gain = change * b.unsqueeze(-2) + softplus(flipped).sum(-1) - softplus(field).sum(-1, keepdim=True)
-        return -softplus(gain)
-
-    return in_chunks(of_rows, v, model.n_visible * model.n_hidden)
-
-
-def _binary(model: EnergyModel, v: Tensor) -> Tensor:
-    """Images with the model's replica axes."""
-    replicas = model.replicas
-    fits = v.ndim >= 2 and v.shape[-1] == model.n_visible and v.shape[:-2] in ((), replicas)
-    allowed = f"(n, {model.n_visible}), or with the replica axes {replicas} in front of it"
-    require(fits, "shape of v", tuple(v.shape), allowed)
-    other = v[(v != 0) & (v != 1)]
-    remedy = "Grey values have no likelihood under a Bernoulli RBM: binarise the images, say v > 0.5."
-    require(not len(other), "v", float(other[0]) if len(other) else 0.0, "values in {0, 1}", remedy)
-    return v.expand(*replicas, *v.shape[-2:])
-
-
-def _of_rbm(model: EnergyModel) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Weights and both biases in float64, if the model is an RBM: sums over h have a closed form then."""
-    if model.quadratic_form().pairs is not None:
-        return None
-    rbm = as_two_layers(model).rbm
-    return rbm.weight.double(), rbm.b.double(), rbm.c.double()

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.rbm import RBM
 
 MOST_UNITS = 32
@@ -73,10 +74,15 @@ def enumerable(model: RBM, max_units: int) -> Layers:
         f"All its states would take about {_duration(seconds)} on {n_threads} CPU threads: raise max_units (at "
         f"most {MOST_UNITS}) if you can wait, or estimate log Z (Ais).",
     )
+    require_finite(model)
+    return layers
+
+
+def require_finite(model: EnergyModel) -> None:
+    """Raise unless all parameters are finite."""
     for name, parameter in model.named_parameters():
         finite = bool(parameter.isfinite().all())
         require(finite, name, "not finite", "finite numbers", "Training diverged: use a smaller learning rate.")
-    return layers
 
 
 def log_weights(

@@ -1,11 +1,12 @@
 """Energy models and networks, each a ``torch.nn.Module`` on the replica axis."""
 
 from memcomp_lightning.models.base import Block, Chains, EnergyModel, QuadraticForm, TwoLayers, as_two_layers
+from memcomp_lightning.models.bit_form import BitForm, bit_form, descend, read_bits
 from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
-from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier, mean_log_odds, start_at_means
+from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier, independent_bias, start_at_means
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.parts import energy_models, joint_model
 from memcomp_lightning.models.randomise import GaussianMoments, Randomiser, Shuffled
@@ -18,6 +19,7 @@ __all__ = [
     "RBM",
     "BatchNorm",
     "BatchNormReluNetwork",
+    "BitForm",
     "Block",
     "BoltzmannMachine",
     "Chains",
@@ -34,11 +36,14 @@ __all__ = [
     "Uniform",
     "Xavier",
     "as_two_layers",
+    "bit_form",
+    "descend",
     "energy_models",
     "hidden_blocks",
     "joint_model",
     "mean_field",
-    "mean_log_odds",
+    "read_bits",
+    "independent_bias",
     "stacked",
     "start_at_means",
     "with_batch_norm_relu",

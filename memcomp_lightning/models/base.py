@@ -8,9 +8,11 @@ from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.units.base import Units
 from memcomp_lightning.types import Configurations
 
 if TYPE_CHECKING:
+    from memcomp_lightning.models.bit_form import BitForm
     from memcomp_lightning.models.rbm import RBM
 
 Readout = Literal["mean", "sample"]
@@ -35,15 +37,17 @@ class Block(NamedTuple):
         neighbours: Indices of the units coupled to any of them, ``(n_neighbours,)``.
         weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
         bias: ``(*replicas, n_class)``.
+        kind: What the units are.
     """
 
     units: Tensor
     neighbours: Tensor
     weight: Tensor
     bias: Tensor
+    kind: Units
 
     def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
-        """Log odds of each unit given all others."""
+        """Field of each unit given all others: the log odds of units in {0, 1}."""
         return affine(x[..., self.neighbours], self.weight, self.bias)
 
 
@@ -89,13 +93,16 @@ class Chains(Protocol):
     """Whether either layer can be read as means or as samples."""
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
-        """Draw n states a replica, each unit 0 or 1 with probability 1/2."""
+        """Draw n states a replica as at infinite temperature: bits and states of a site with equal probability."""
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
-        """Draw every unit once given the others, at inverse temperature ``beta``, a number or ``(..., n, 1)``."""
+        """Draw every unit once given the others, at inverse temperature ``beta``, a number or ``(..., n, 1)``.
+
+        It multiplies the fields; real units keep their measure.
+        """
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
-        """Sweep, and return the energy of the new joint state as well, ``(*replicas, n)``."""
+        """Sweep, and return the ``tempered_energy`` of the new joint state as well, ``(*replicas, n)``."""
 
     def read(self, x: Tensor) -> Configurations:
         """Return the states, one class (in an RBM the hidden units) replaced by its means given the others."""
@@ -110,9 +117,10 @@ class Chains(Protocol):
 
 
 class EnergyModel(Protocol):
-    """What a model must offer to be trained and measured: units in {0, 1}, their energies, means and chains.
+    """What a model must offer to be trained and measured: units of some kind, their energies, means and chains.
 
-    The energy is linear in each unit: at values in [0, 1] it is the expected one of independent units.
+    The energy is linear in each unit but for the measures of real ones: where these are constant, it is, at means of
+    independent units, the expected one.
     """
 
     b: nn.Parameter
@@ -135,17 +143,34 @@ class EnergyModel(Protocol):
         """Number of all units."""
 
     @property
-    def n_enumerated(self) -> int:
-        """Number of units whose states exact computations enumerate: all outside the largest class."""
+    def visible(self) -> Units:
+        """The kind of the visible units."""
+
+    @property
+    def hidden(self) -> Units:
+        """The kind of the hidden units."""
+
+    @property
+    def n_enumerated(self) -> float:
+        """Number of bits that exact computations enumerate: those of the states of all units outside the largest class."""
 
     def double(self) -> Self:
         """The model itself, with its numbers in float64 from now on."""
 
     def parameters(self) -> Iterator[nn.Parameter]:
-        """Couplings and biases."""
+        """Couplings, biases, and what the units have of their own."""
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
+        """The same with their names."""
 
     def energy(self, v: Tensor, h: Tensor) -> Tensor:
         """E(v, h) of each configuration, ``(*replicas, n)``."""
+
+    def tempered_energy(self, v: Tensor, h: Tensor) -> Tensor:
+        """E(v, h) without the measures of the units: what an inverse temperature multiplies."""
+
+    def project(self) -> None:
+        """Bring the units' own parameters back to where they are allowed, after a step of an optimiser."""
 
     def total_energy(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor:
         """Sum of ``weight * E(v, h)`` over configurations, ``(*replicas,)``; weights of any sign."""
@@ -168,6 +193,9 @@ class EnergyModel(Protocol):
     def blocks(self) -> Sequence[Block]:
         """The classes of units, each with its couplings."""
 
+    def outside_largest_class(self) -> tuple[Block, Tensor, Units]:
+        """The class that exact computations sum in closed form, all other units, and what these are."""
+
     def chains(self) -> Chains:
         """Gibbs chains at the present parameters."""
 
@@ -176,6 +204,9 @@ class EnergyModel(Protocol):
 
     def quadratic_form(self) -> QuadraticForm:
         """Couplings and biases as they stand in the energy."""
+
+    def in_bits(self) -> "BitForm":
+        """The energy in bits, for solvers of QUBOs."""
 
     def two_layers(self) -> TwoLayers | None:
         """The RBM with the same energies; None where the units do not fall into two classes."""

@@ -8,17 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
-from torch.nn.functional import softplus
 
-from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
 from memcomp_lightning.models.init import Gaussian, Initialiser
-from memcomp_lightning.models.machine import Machine
+from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
 from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.models.units import Bernoulli, Mixed, Units, all_states, side_by_side
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations
 
@@ -40,16 +39,17 @@ _INDICES = ("units", "neighbours", "edge", "slot")
 
 
 class BoltzmannMachine(Machine):
-    r"""A model of binary data v with hidden units h: x = (v, h) in {0, 1}, with couplings between any pairs.
+    r"""A model of data v with hidden units h: x = (v, h), with couplings between any pairs.
 
-    .. math:: E(x) = -\sum_{(i, j)} w_{ij} x_i x_j - \sum_i a_i x_i, \qquad a = (b, c)
+    .. math:: E(x) = -\sum_{(i, j)} w_{ij} x_i x_j - \sum_i a_i x_i - \log \mu(x), \qquad a = (b, c)
 
     (Ackley, Hinton & Sejnowski 1985.) The units are split into classes without couplings inside, so that a class
-    is drawn, or its means are taken, at once. Real values in [0, 1] stand for the probabilities of independent
-    units.
+    is drawn, or its means are taken, at once. Values between those of the units stand for the means of independent
+    ones. With spins and no hidden units it is an Ising model with the couplings J and the biases h; with
+    categorical units a Potts model, whose pairs of sites have a coupling for each pair of states.
 
     Attributes:
-        pairs: Coupled units, ``(n_pairs, 2)``, visible ones numbered first; part of the state dict, so that
+        pairs: Coupled entries, ``(n_pairs, 2)``, visible ones numbered first; part of the state dict, so that
             weights go into a machine of the same pairs alone.
         coupling: w, one number a pair, ``(*replicas, n_pairs)``.
         b: Visible bias, ``(*replicas, n_visible)``.
@@ -57,11 +57,14 @@ class BoltzmannMachine(Machine):
         classes: Indices of the units of each class; classes with more visible units come first.
 
     Args:
-        n_visible: Number of visible units, >= 1.
-        n_hidden: Number of hidden units, >= 0; None is what the pairs of ``connectivity`` have beside the visible
-            ones.
-        connectivity: Pairs of units, or a symmetric mask ``(n_units, n_units)``; None couples all. See
+        n_visible: Number of visible units in {0, 1}, >= 1; None where ``visible`` says it.
+        n_hidden: Number of hidden units in {0, 1}, >= 0; None where ``hidden`` says it, or else what the pairs of
+            ``connectivity`` have beside the visible ones.
+        connectivity: Pairs of sites (for units of one entry, of units), or a symmetric mask ``(n_sites, n_sites)``;
+            None couples all. See
             :mod:`memcomp_lightning.models.connectivity` for grids, layers and graphs of annealers.
+        visible: Kind of the visible units, see :mod:`memcomp_lightning.models.units`.
+        hidden: Kind of the hidden units, not real.
         replicas: Leading axes of independent machines that share every call.
         weight_init: Draws a matrix ``(*replicas, n_units, n_units)``, whose upper triangle gives the couplings;
             the biases start at zero.
@@ -69,7 +72,7 @@ class BoltzmannMachine(Machine):
 
     Raises:
         SettingError: A mask that is not symmetric or couples a unit to itself; a pair that is given twice or whose
-            units do not exist; a visible unit without any coupling.
+            units do not exist; a visible unit without any coupling; two real units that are coupled.
 
     >>> machine = BoltzmannMachine(n_visible=3, n_hidden=2)
     >>> machine.energy(torch.zeros(5, 3), torch.zeros(5, 2)).shape
@@ -79,27 +82,37 @@ class BoltzmannMachine(Machine):
     @torch.inference_mode(False)
     def __init__(
         self,
-        n_visible: int,
+        n_visible: int | None = None,
         n_hidden: int | None = None,
         connectivity: Tensor | Iterable[tuple[int, int]] | None = None,
         *,
+        visible: Units | None = None,
+        hidden: Units | None = None,
         replicas: tuple[int, ...] = (),
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__()
-        require_count("n_visible", n_visible)
-        if n_hidden is None:
+        visible = units_of("visible", n_visible, visible)
+        if n_hidden is None and hidden is None:
             listed = isinstance(connectivity, Tensor) and connectivity.ndim == 2 and connectivity.shape[1] == 2
             require(listed, "n_hidden", n_hidden, "a number, unless connectivity is a tensor of pairs")
             assert isinstance(connectivity, Tensor)
-            n_hidden = int(connectivity.max()) + 1 - n_visible
-        require_count("n_hidden", n_hidden, minimum=0)
-        n_units = n_visible + n_hidden
-        pairs = _pairs_of(n_units, connectivity)
-        alone = torch.bincount(pairs.flatten(), minlength=n_units)[:n_visible] == 0
+            n_hidden = int(connectivity.max()) + 1 - visible.n_sites
+        if hidden is None:
+            require_count("n_hidden", n_hidden, minimum=0)
+            assert n_hidden is not None
+            hidden = Bernoulli(n_hidden)
+        require(not hidden.real, "kind of the hidden units", type(hidden).__name__, "units that are not real")
+        super().__init__(visible.for_replicas(replicas), hidden.for_replicas(replicas))
+        n_visible, n_units = visible.n, visible.n + hidden.n
+        site_of = torch.cat((visible.site_of(), hidden.site_of() + visible.n_sites))
+        n_sites = visible.n_sites + hidden.n_sites
+        site_pairs = _pairs_of(n_sites, connectivity)
+        pairs = _of_entries(site_pairs, site_of, n_sites)
+        _refuse_real_pairs(visible, pairs)
+        alone = torch.bincount(site_pairs.flatten(), minlength=n_sites)[: visible.n_sites] == 0
         require(
-            not bool(alone.any()) or n_units == 1,
+            not bool(alone.any()) or n_sites == 1,
             "visible unit",
             alone.nonzero()[:5].flatten().tolist(),
             "at least one coupling for each visible unit",
@@ -111,8 +124,13 @@ class BoltzmannMachine(Machine):
         draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
         self.coupling = nn.Parameter(draw)
         self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
-        self.c = nn.Parameter(draw.new_zeros(*replicas, n_hidden))
-        classes = sorted(colouring(n_units, pairs), key=lambda units: -int((units < n_visible).sum()))
+        self.c = nn.Parameter(draw.new_zeros(*replicas, hidden.n))
+        coloured = [torch.isin(site_of, sites).nonzero().flatten() for sites in colouring(n_sites, site_pairs)]
+        classes = sorted(coloured, key=lambda units: -int((units < n_visible).sum()))
+        kinds = [_kind_of(self.visible, self.hidden, units) for units in classes]
+        # Without parameters of their own they stay as they are, and are not made anew at each sweep.
+        changing = any(buffer.is_floating_point() for kind in kinds for buffer in kind.buffers())
+        self._kinds = None if changing else nn.ModuleList(kinds)
         self._n_forward: list[int] = []
         for number, layout in enumerate(_layouts(n_units, pairs, classes)):
             self._n_forward.append(layout.n_forward)
@@ -169,9 +187,13 @@ class BoltzmannMachine(Machine):
     def blocks(self) -> list[Block]:
         """The classes, each with its couplings: what a sweep over all units needs."""
         bias, found = self.bias, []
-        for units, neighbours, edge, slot, _ in self._layouts():
+        layouts = self._layouts()
+        kinds = self._kinds
+        if kinds is None:
+            kinds = [_kind_of(self.visible, self.hidden, layout.units) for layout in layouts]
+        for (units, neighbours, edge, slot, _), kind in zip(layouts, kinds, strict=True):
             weight = self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
-            found.append(Block(units, neighbours, weight, bias[..., units]))
+            found.append(Block(units, neighbours, weight, bias[..., units], kind))
         return found
 
     def _placed(self, shape: tuple[int, int], at: Tensor, coupling: Tensor) -> Tensor:
@@ -185,24 +207,34 @@ class BoltzmannMachine(Machine):
         return ClassChains(self)
 
     @property
-    def n_enumerated(self) -> int:
-        """Number of units whose states exact computations enumerate: all outside the largest class."""
-        return self.n_units - max(len(units) for units in self.classes)
+    def n_enumerated(self) -> float:
+        """Number of bits that exact computations enumerate: those of all units outside the largest class."""
+        return log2_states(self.outside_largest_class()[2])
+
+    def outside_largest_class(self) -> tuple[Block, Tensor, Units]:
+        """The class whose states are summed in closed form, all other units, and what these are."""
+        largest = max(self.blocks(), key=lambda block: math.inf if block.kind.real else log2_states(block.kind))
+        others = torch.ones(self.n_units, dtype=torch.bool, device=self.b.device)
+        others[largest.units] = False
+        entries = others.nonzero().flatten()
+        return largest, entries, _kind_of(self.visible, self.hidden, entries)
 
     @torch.no_grad()
     def all_configurations(self) -> Configurations:
         """All states outside the largest class with their probabilities as weights, that class by its means."""
-        largest = max(self.blocks(), key=lambda block: len(block.units))
-        others = torch.ones(self.n_units, dtype=torch.bool, device=self.b.device)
-        others[largest.units] = False
-        states = binary_states(self.n_enumerated, like=self.b)
+        largest, others, kind = self.outside_largest_class()
+        states = all_states(kind, self.b)
         x = states.new_zeros(*self.replicas, len(states), self.n_units)
         x[..., others] = states
-        # Summed over the largest class: exp(-E) with that class off, times 1 + exp(field) for each of its units.
+        # Summed over the largest class: exp(-E) with that class at zero, times exp(A(field)) for each of its sites.
         field, n = largest.field(x), self.n_visible
-        log_weight = softplus(field.double()).sum(-1) - self.energy(x[..., :n], x[..., n:]).double()
-        x[..., largest.units] = torch.sigmoid(field)
-        return Configurations(x[..., :n], x[..., n:], torch.softmax(log_weight, dim=-1).to(x.dtype))
+        log_weight = largest.kind.cumulant(field.double()).sum(-1) - self.energy(x[..., :n], x[..., n:]).double()
+        weight, found = torch.softmax(log_weight, dim=-1).to(x.dtype), []
+        for values in largest.kind.points(field):
+            x = x.clone()
+            x[..., largest.units] = values
+            found.append(Configurations(x[..., :n], x[..., n:], weight))
+        return joined(found)
 
     def quadratic_form(self) -> QuadraticForm:
         """The couplings of all pairs, and the biases."""
@@ -223,8 +255,8 @@ class BoltzmannMachine(Machine):
         at = (second[across] - n) * n + first[across]
         return self._placed((self.n_hidden, n), at, self.coupling[..., across])
 
-    def energy(self, v: Visible, h: Hidden) -> PerState:
-        """E(v, h) of each configuration."""
+    def tempered_energy(self, v: Visible, h: Hidden) -> PerState:
+        """E(v, h) without the measures of the units."""
         x = torch.cat((v, h), dim=-1)
         coupled = sum(
             ((block.field(x) - block.bias.unsqueeze(-2)) * x[..., block.units]).sum(-1) for block in self.blocks()
@@ -279,7 +311,7 @@ class BoltzmannMachine(Machine):
 def _folded(model: BoltzmannMachine) -> RBM:
     """The RBM between the two classes of a machine that has two, the units of the first as its visible ones."""
     first, second = model.blocks()
-    rbm = RBM(len(first.units), len(second.units), replicas=model.replicas)
+    rbm = RBM(visible=first.kind, hidden=second.kind, replicas=model.replicas)
     rbm.to(model.b)
     weight = torch.zeros_like(rbm.weight)
     weight[..., torch.searchsorted(first.units, second.neighbours)] = second.weight
@@ -318,3 +350,35 @@ def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Lay
         slot = place[end[:, 0]] * len(neighbours) + column
         found.append(_Layout(units, neighbours, edge, slot, int(forward.sum())))
     return found
+
+
+def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Pairs:
+    """Pairs of entries, all of one site with all of the other, in ascending order."""
+    if len(site_of) == n_sites:
+        return site_pairs
+    entries = [(site_of == site).nonzero().flatten() for site in range(n_sites)]
+    found = torch.cat([torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist()])
+    return found[(found[:, 0] * len(site_of) + found[:, 1]).argsort()]
+
+
+def _kind_of(visible: Units, hidden: Units, entries: Tensor) -> Units:
+    """What some entries of a machine are."""
+    if isinstance(visible, Bernoulli) and isinstance(hidden, Bernoulli):
+        return Bernoulli(len(entries))
+    seen = entries < visible.n
+    return side_by_side(visible.select(entries[seen]), hidden.select(entries[~seen] - visible.n))
+
+
+def _refuse_real_pairs(visible: Units, pairs: Pairs) -> None:
+    """Raise if two real units are coupled: the energy need not be bounded then."""
+    if not visible.real:
+        return
+    discrete = torch.zeros(int(pairs.max()) + 1 if len(pairs) else 0, dtype=torch.bool)
+    n = 0
+    for kind in visible.kinds if isinstance(visible, Mixed) else [visible]:
+        discrete[n : n + kind.n] = not kind.real
+        n += kind.n
+    discrete[n:] = True
+    coupled = pairs[~discrete[pairs[:, 0]] & ~discrete[pairs[:, 1]]]
+    allowed = "no couplings between real units, as in an RBM"
+    require(not len(coupled), "coupled real units", coupled[:1].flatten().tolist(), allowed)

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning import rng
 from memcomp_lightning.models.base import EnergyModel, Readout
+from memcomp_lightning.models.units import Units, side_by_side
 from memcomp_lightning.types import Configurations
 
 if TYPE_CHECKING:
@@ -24,14 +24,13 @@ def sweep(model: "RBM", v: Tensor, *, beta: float | Tensor = 1.0, generator: Gen
 
 
 def _swept(model: "RBM", v: Tensor, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
-    h = rng.bernoulli(model.hidden_mean(v, beta=beta), generator=generator)
-    return rng.bernoulli(model.visible_mean(h, beta=beta), generator=generator), h
+    h = model.draw_hidden(v, beta=beta, generator=generator)
+    return model.draw_visible(h, beta=beta, generator=generator), h
 
 
-def random_states(model: EnergyModel, n: int, n_units: int, *, generator: Generator) -> Tensor:
-    """Draw n states of so many units a replica, each unit 0 or 1 with probability 1/2."""
-    half = torch.full((*model.replicas, n, n_units), 0.5, dtype=model.b.dtype, device=model.b.device)
-    return rng.bernoulli(half, generator=generator)
+def random_states(model: EnergyModel, units: Units, n: int, *, generator: Generator) -> Tensor:
+    """Draw n states of some units a replica without fields: as at infinite temperature."""
+    return units.sample(model.b.new_zeros(*model.replicas, n, units.n), generator=generator)
 
 
 class TwoLayerChains:
@@ -44,16 +43,16 @@ class TwoLayerChains:
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw visible units."""
-        return random_states(self._model, n, self._model.n_visible, generator=generator)
+        return random_states(self._model, self._model.visible, n, generator=generator)
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw h given v, then v given h."""
         return sweep(self._model, x, beta=beta, generator=generator)
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
-        """Draw h given v, then v given h; the energy of both."""
+        """Draw h given v, then v given h; the energy of both that beta multiplies."""
         v, h = _swept(self._model, x, beta, generator)
-        return v, self._model.energy(v, h)
+        return v, self._model.tempered_energy(v, h)
 
     def read(self, x: Tensor) -> Configurations:
         """The visible units and the hidden means given them."""
@@ -63,16 +62,14 @@ class TwoLayerChains:
         self, positive: Configurations, k: int, *, visible: Readout, hidden: Readout, generator: Generator
     ) -> Configurations:
         """The first half sweep takes the hidden means that the positive phase has computed already."""
-        h = rng.bernoulli(positive.h, generator=generator)
+        model = self._model
+        known = model.hidden.sample_of_mean(positive.h, generator=generator)
+        h = model.draw_hidden(positive.v, generator=generator) if known is None else known
         for _ in range(k - 1):
-            v = rng.bernoulli(self._model.visible_mean(h), generator=generator)
-            h = rng.bernoulli(self._model.hidden_mean(v), generator=generator)
-        v = self._model.visible_mean(h)
-        if visible == "sample":
-            v = rng.bernoulli(v, generator=generator)
-        h = self._model.hidden_mean(v)
-        if hidden == "sample":
-            h = rng.bernoulli(h, generator=generator)
+            v = model.draw_visible(h, generator=generator)
+            h = model.draw_hidden(v, generator=generator)
+        v = model.visible_mean(h) if visible == "mean" else model.draw_visible(h, generator=generator)
+        h = model.hidden_mean(v) if hidden == "mean" else model.draw_hidden(v, generator=generator)
         return Configurations(v, h, positive.weight)
 
 
@@ -87,31 +84,33 @@ class ClassChains:
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw all units."""
-        return random_states(self._model, n, self._model.n_units, generator=generator)
+        return random_states(self._model, side_by_side(self._model.visible, self._model.hidden), n, generator=generator)
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw each class given all others."""
         x = x.clone()
         for block in self._blocks:
-            x[..., block.units] = rng.bernoulli(torch.sigmoid(beta * block.field(x)), generator=generator)
+            x[..., block.units] = block.kind.sample(beta * block.field(x), generator=generator)
         return x
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         """Sweep, and the energy of the new state."""
         x = self.sweep(x, beta=beta, generator=generator)
-        return x, self._model.energy(*self._split(x))
+        return x, self._model.tempered_energy(*self._split(x))
 
     def read(self, x: Tensor) -> Configurations:
-        """The states, the last class by its means."""
+        """The states, the last class by its means, unless its units are real."""
         x, last = x.clone(), self._blocks[-1]
-        x[..., last.units] = torch.sigmoid(last.field(x))
+        if last.kind.linear:
+            x[..., last.units] = last.kind.mean(last.field(x))
         return Configurations(*self._split(x))
 
     def from_data(
         self, positive: Configurations, k: int, *, visible: Readout, hidden: Readout, generator: Generator
     ) -> Configurations:
         """Sweep all units from the data, with hidden units drawn by their means; read as by ``read``."""
-        x = torch.cat((positive.v, rng.bernoulli(positive.h, generator=generator)), dim=-1)
+        hidden = self._model.hidden.sample_of_mean(positive.h, generator=generator)
+        x = torch.cat((positive.v, positive.h if hidden is None else hidden), dim=-1)
         for _ in range(k):
             x = self.sweep(x, generator=generator)
         return self.read(x)._replace(weight=positive.weight)

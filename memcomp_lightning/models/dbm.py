@@ -12,6 +12,8 @@ from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.connectivity import layered
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.init import Initialiser
+from memcomp_lightning.models.machine import units_of
+from memcomp_lightning.models.units import Units
 
 
 class DBM(BoltzmannMachine):
@@ -22,8 +24,9 @@ class DBM(BoltzmannMachine):
     (Salakhutdinov & Hinton 2009.) The odd and the even layers are the two classes of units.
 
     Args:
-        n_visible: Number of visible units.
+        n_visible: Number of visible units in {0, 1}; None where ``visible`` says it.
         hidden_sizes: Units of each hidden layer, at least one layer.
+        visible: Kind of the visible units, see :mod:`memcomp_lightning.models.units`.
         replicas: Leading axes of independent machines.
         weight_init: Draws the weights of each layer, as in :class:`DBN`: the same stream gives the same weights.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
@@ -34,19 +37,22 @@ class DBM(BoltzmannMachine):
 
     def __init__(
         self,
-        n_visible: int,
-        hidden_sizes: Sequence[int],
+        n_visible: int | None = None,
+        hidden_sizes: Sequence[int] = (),
         *,
+        visible: Units | None = None,
         replicas: tuple[int, ...] = (),
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
     ) -> None:
         require_count("number of hidden layers", len(hidden_sizes))
-        self.sizes = (n_visible, *hidden_sizes)
+        visible = units_of("visible", n_visible, visible)
+        self.sizes = (visible.n, *hidden_sizes)
         super().__init__(
-            n_visible,
+            None,
             sum(hidden_sizes),
-            layered(self.sizes),
+            layered((visible.n_sites, *hidden_sizes)),
+            visible=visible,
             replicas=replicas,
             weight_init=weight_init,
             generator=generator,
@@ -56,7 +62,7 @@ class DBM(BoltzmannMachine):
     @torch.no_grad()
     def from_dbn(cls, dbn: DBN) -> "DBM":
         """The machine with the weights of a DBN, on its device."""
-        machine = cls(dbn.n_visible, [rbm.n_hidden for rbm in dbn], replicas=dbn.replicas)
+        machine = cls(hidden_sizes=[rbm.n_hidden for rbm in dbn], visible=dbn[0].visible, replicas=dbn.replicas)
         machine.to(dbn[0].b)
         machine.take(dbn)
         return machine
@@ -97,6 +103,7 @@ class DBM(BoltzmannMachine):
         self._check(dbn)
         self.coupling.copy_(_flat([rbm.weight for rbm in dbn]))
         self.b.copy_(dbn[0].b)
+        self.visible.load_state_dict(dbn[0].visible.state_dict())
         above = [*(rbm.b for rbm in list(dbn)[1:]), torch.zeros_like(dbn[-1].c)]
         self.c.copy_(torch.cat([rbm.c + b for rbm, b in zip(dbn, above, strict=True)], dim=-1))
 
@@ -115,6 +122,7 @@ class DBM(BoltzmannMachine):
             rbm.b.zero_()
             rbm.c.copy_(c)
         dbn[0].b.copy_(self.b)
+        dbn[0].visible.load_state_dict(self.visible.state_dict())
 
     def _check(self, dbn: DBN) -> None:
         sizes = (dbn.n_visible, *(rbm.n_hidden for rbm in dbn))

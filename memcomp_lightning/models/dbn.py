@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.base import Hidden, Visible
 from memcomp_lightning.models.init import Initialiser
 from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.rng import stream
 
 
@@ -19,8 +20,9 @@ class DBN(nn.Module):
     """A stack of RBMs; the hidden units of one are the visible units of the next.
 
     Args:
-        n_visible: Number of inputs.
-        hidden_sizes: Units of each hidden layer, at least one layer.
+        n_visible: Number of inputs in [0, 1]; None where ``visible`` says it.
+        hidden_sizes: Units of each hidden layer, in {0, 1}; at least one layer.
+        visible: Kind of the inputs, see :mod:`memcomp_lightning.models.units`.
         replicas: Leading axes of independent networks.
         weight_init: Draws the weights of every layer; biases start at zero.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
@@ -32,9 +34,10 @@ class DBN(nn.Module):
 
     def __init__(
         self,
-        n_visible: int,
-        hidden_sizes: Sequence[int],
+        n_visible: int | None = None,
+        hidden_sizes: Sequence[int] = (),
         *,
+        visible: Units | None = None,
         replicas: tuple[int, ...] = (),
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
@@ -42,10 +45,13 @@ class DBN(nn.Module):
         super().__init__()
         require_count("number of hidden layers", len(hidden_sizes))
         generator = stream(0, "weights") if generator is None else generator
-        self.rbms = nn.ModuleList(
-            RBM(n_in, n_out, replicas=replicas, weight_init=weight_init, generator=generator)
-            for n_in, n_out in pairwise([n_visible, *hidden_sizes])
-        )
+        settings: dict[str, Any] = {
+            "replicas": replicas,
+            "weight_init": weight_init,
+            "generator": generator,
+        }
+        self.rbms = nn.ModuleList([RBM(n_visible, hidden_sizes[0], visible=visible, **settings)])
+        self.rbms += [RBM(n_in, n_out, **settings) for n_in, n_out in pairwise(hidden_sizes)]
 
     def __len__(self) -> int:
         return len(self.rbms)

@@ -10,6 +10,8 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel, Images
+from memcomp_lightning.models.observed import check_observed
+from memcomp_lightning.models.units import Bernoulli, Units
 from memcomp_lightning.rng import stream
 
 
@@ -70,23 +72,58 @@ def initial(shape: tuple[int, ...], weight_init: Initialiser | None, generator: 
     return draw(shape, generator=stream(0, "weights") if generator is None else generator)
 
 
-def mean_log_odds(v: Images) -> Float[Tensor, "*axes n_visible"]:
-    """Biases of independent units that have the data's means: log (n_on + 1) / (n_off + 1).
+def independent_bias(
+    v: Images, visible: Units | None = None, observed: Tensor | None = None
+) -> Float[Tensor, "*axes n_visible"]:
+    """Biases of units without couplings that have the data's means.
 
-    >>> mean_log_odds(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
+    Args:
+        v: Data.
+        visible: The kind of the units; None is units in {0, 1}, of which it is log (n_on + 1) / (n_off + 1).
+        observed: A mask of the values that count; None is all of them.
+
+    >>> independent_bias(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
     tensor([1.0986, 0.0000])
     """
-    n_on = v.sum(-2)
-    return torch.log((n_on + 1) / (v.shape[-2] - n_on + 1))
+    visible = Bernoulli(v.shape[-1]) if visible is None else visible
+    total, n, _ = _sums(v, observed)
+    return visible.bias_of(total, n)
 
 
 @torch.no_grad()
-def start_at_means(model: EnergyModel, v: Images) -> None:
+def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None) -> None:
     """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
 
-    Hinton 2012, A Practical Guide to Training RBMs, section 8.1. The data may be without the model's replica axes.
+    Precisions of real units that are learned become those of the data. Hinton 2012, A Practical Guide to Training
+    RBMs, section 8.1. The data may be without the model's replica axes.
+
+    Args:
+        model: The model.
+        v: Data.
+        observed: A mask of the values that count; None is all of them.
+
+    Raises:
+        SettingError: A value that the units do not take; a column of real units that is constant; a mask that hides
+            a whole row or column.
     """
-    model.b.copy_(mean_log_odds(v).expand(model.b.shape))
+    visible = model.visible
+    visible.check(v, observed)
+    if visible.real or observed is not None:
+        if observed is not None:
+            check_observed(model, v, observed)
+        total, n, variance = _sums(v, observed)
+        visible.start(total / n, variance)
+    model.b.copy_(independent_bias(v, visible, observed).expand(model.b.shape))
+
+
+def _sums(v: Tensor, observed: Tensor | None) -> tuple[Tensor, float | Tensor, Tensor]:
+    """Of each column its sum, the number of values, and their variance."""
+    if observed is None:
+        return v.sum(-2), v.shape[-2], v.var(-2, correction=0)
+    known, n = torch.where(observed, v, 0.0), observed.sum(-2).to(v.dtype)
+    total = known.sum(-2)
+    deviation = torch.where(observed, v - (total / n.clamp(min=1)).unsqueeze(-2), 0.0)
+    return total, n, deviation.square().sum(-2) / n.clamp(min=1)
 
 
 def _empty(shape: tuple[int, ...], generator: Generator) -> Tensor:

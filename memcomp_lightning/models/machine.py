@@ -1,14 +1,20 @@
 """What RBMs and Boltzmann machines share: numbers of units, and sums of the energy over configurations."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.linalg import vecdot
 
 from memcomp_lightning.ambient import in_own_dtypes
-from memcomp_lightning.models.base import Hidden, PerReplica, PerState, Visible
+from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.base import EnergyModel, Hidden, PerReplica, PerState, Visible
+from memcomp_lightning.models.bit_form import BitForm, bit_form
+from memcomp_lightning.models.units import Bernoulli, Units
 from memcomp_lightning.objective import shares
 from memcomp_lightning.types import Configurations
 
@@ -18,10 +24,19 @@ class Machine(nn.Module):
 
     The energy is linear in the parameters: a sum over configurations needs only the *moments*, the sums of what
     each parameter is multiplied with, and no product of matrices in its backward pass.
+
+    Args:
+        visible: The kind of the visible units, with the model's replica axes.
+        hidden: The kind of the hidden units.
     """
 
     b: nn.Parameter
     c: nn.Parameter
+
+    def __init__(self, visible: Units, hidden: Units) -> None:
+        super().__init__()
+        self.visible = visible
+        self.hidden = hidden
 
     @property
     def n_visible(self) -> int:
@@ -43,6 +58,31 @@ class Machine(nn.Module):
         """Leading axes of independent machines."""
         return tuple(self.b.shape[:-1])
 
+    def energy(self, v: Visible, h: Hidden) -> PerState:
+        """E(v, h) of each configuration."""
+        energy = self.tempered_energy(v, h)
+        for units, x in ((self.visible, v), (self.hidden, h)):
+            if not units.linear:
+                energy = energy + units.energy(x)
+        return energy
+
+    @abstractmethod
+    def tempered_energy(self, v: Visible, h: Hidden) -> PerState:
+        """E(v, h) without the measures of the units: what an inverse temperature multiplies."""
+
+    def project(self) -> None:
+        """Bring the units' own parameters back to where they are allowed, after a step of an optimiser."""
+        for units in (self.visible, self.hidden):
+            units.project()
+
+    def in_bits(self) -> BitForm:
+        """The energy in bits, for solvers of QUBOs.
+
+        Raises:
+            SettingError: The model has units without a form in bits.
+        """
+        return bit_form(cast(EnergyModel, self))
+
     def mean_energy(self, configurations: Configurations) -> PerReplica:
         """Mean of E over configurations, by their weights."""
         return self.total_energy(configurations.v, configurations.h, shares(configurations))
@@ -52,7 +92,7 @@ class Machine(nn.Module):
         """Weighted sum of E over configurations, constants to autograd; the weights may have any sign."""
         with torch.no_grad():
             moments = self._moments(v, h, weight)
-        return self._energy_of(moments)
+        return self._energy_of(moments) + self._of_measures(v, h, weight)
 
     @in_own_dtypes
     def centred_total_energy(
@@ -63,15 +103,43 @@ class Machine(nn.Module):
         visible_offset: Float[Tensor, "*replicas n_visible"],
         hidden_offset: Float[Tensor, "*replicas n_hidden"],
     ) -> PerReplica:
-        """The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
+        r"""The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
 
-        (Montavon & Mueller 2012.)
+        (Montavon & Mueller 2012.) Real units are centred in their squares too: with the energy
+        :math:`\gamma (v - \mu)^2 / 2 - b' (v - \mu)` a step of :math:`\gamma` moves :math:`b = b' + \gamma \mu` with it.
         """
         with torch.no_grad():
             value = self.total_energy(v, h, weight)
             moments = self._centred_moments(v, h, weight, visible_offset, hidden_offset)
         surrogate = self._energy_of(moments)
+        curvature = self.visible.curvature
+        if curvature is not None and curvature.requires_grad:
+            with torch.no_grad():
+                squares = self._half_squares(v - visible_offset.unsqueeze(-2), weight)
+                at = curvature != 0
+            surrogate = surrogate + vecdot(curvature, squares) + vecdot(self.b, at * visible_offset * squares)
         return value + (surrogate - surrogate.detach())
+
+    def _of_measures(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor | float:
+        """Weighted sum of ``-log mu`` over configurations: by moments where a precision multiplies squares."""
+        total: Tensor | float = 0.0
+        for units, x in ((self.visible, v), (self.hidden, h)):
+            if units.linear:
+                continue
+            curvature = units.curvature
+            if curvature is None:
+                total = total + (weight * units.energy(x)).sum(-1)
+            else:
+                with torch.no_grad():
+                    squares = self._half_squares(x, weight)
+                total = total + vecdot(curvature, squares)
+        return total
+
+    @staticmethod
+    def _half_squares(x: Tensor, weight: Tensor) -> Tensor:
+        """Half of the weighted sum of squares of each unit, ``(*replicas, n)``."""
+        squares: Tensor = 0.5 * (weight.unsqueeze(-2) @ x.square()).squeeze(-2)
+        return squares
 
     @abstractmethod
     def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> Sequence[Tensor]:
@@ -86,3 +154,29 @@ class Machine(nn.Module):
     @abstractmethod
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
         """Minus the sum over the parameters of each one times its moment, ``(*replicas,)``."""
+
+
+def units_of(layer: str, n: int | None, units: Units | None) -> Units:
+    """The kind of a layer: the given one, or n units in {0, 1}."""
+    if units is None:
+        require_count(f"n_{layer}", n)
+        assert n is not None
+        return Bernoulli(n)
+    require(isinstance(units, Units), f"{layer} units", units, "a kind of memcomp_lightning.models.units")
+    require(units.n >= 1, f"n_{layer}", units.n, "an integer >= 1")
+    require(n in (None, units.n), f"n_{layer}", n, f"{units.n}, as the {layer} units have it, or None")
+    return units
+
+
+def log2_states(units: Units) -> float:
+    """The bits that it takes to number the states of a layer; a whole number where they are a power of two."""
+    bits = math.log2(units.n_states)
+    return int(bits) if bits == int(bits) else bits
+
+
+def joined(parts: Sequence[Configurations]) -> Configurations:
+    """Configurations one after the other, all with weights."""
+    if len(parts) == 1:
+        return parts[0]
+    v, h, weight = zip(*parts, strict=True)
+    return Configurations(torch.cat(v, dim=-2), torch.cat(h, dim=-2), torch.cat(weight, dim=-1))

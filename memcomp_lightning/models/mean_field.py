@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import Block, EnergyModel, Hidden, PerState, Visible
 
 
@@ -12,16 +13,18 @@ class MeanFieldSolution(NamedTuple):
     """Means of the free units, usually the hidden ones.
 
     Attributes:
-        h: ``(*replicas, n, n_free)`` in (0, 1).
+        h: ``(*replicas, n, n_free)``.
         change: Largest change of a mean in the last iteration of its configuration, ``(*replicas,)``.
         converged: Whether it is below the tolerance, ``(*replicas,)``.
         n_iterations: Iterations done, those of the configuration that took longest.
+        v: The visible units, with the means of those that were not observed.
     """
 
     h: Tensor
     change: Tensor
     converged: Tensor
     n_iterations: int
+    v: Tensor
 
 
 @torch.no_grad()
@@ -30,10 +33,11 @@ def mean_field(
     given: Tensor,
     *,
     clamped: Literal["visible", "hidden"] = "visible",
+    observed: Tensor | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-3,
 ) -> MeanFieldSolution:
-    r"""Approximate the means of the free units: iterate ``m_i = sigmoid(field_i)``, class by class, from 1/2.
+    r"""Approximate the means of the free units: iterate ``m = mean(field)``, class by class, from units without fields.
 
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
     p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration
@@ -41,20 +45,29 @@ def mean_field(
     less than the tolerance > 0, so that they do not depend on the rest of the batch. If one does not get there in
     ``max_iterations`` >= 1, ``converged`` of its replica is False.
 
-    ``given`` are the clamped units in [0, 1], ``(*replicas, n, n_visible)`` or ``(*replicas, n, n_hidden)``.
+    ``given`` are the clamped units, ``(*replicas, n, n_visible)`` or ``(*replicas, n, n_hidden)``. Where visible
+    units are clamped, ``observed``, a mask of their shape, says which; the others are free, like the hidden ones.
     """
     n_visible = model.n_visible
     free = slice(n_visible, None) if clamped == "visible" else slice(0, n_visible)
     n_free = model.n_hidden if clamped == "visible" else n_visible
-    unknown = given.new_full((*given.shape[:-1], n_free), 0.5)
+    free_units = model.hidden if clamped == "visible" else model.visible
+    unknown = free_units.mean(given.new_zeros(*given.shape[:-1], n_free))
+    fixed: Tensor | None = None
+    if observed is None:
+        blocks = _free_blocks(model, clamped)
+        coupled = any(bool(_among(block.neighbours, n_visible, clamped).any()) for block in blocks)
+    else:
+        require(clamped == "visible", "clamped", clamped, "'visible' where a mask says which are observed")
+        given = torch.where(observed, given, model.visible.mean(torch.zeros_like(given)))
+        fixed = torch.cat((observed, torch.zeros_like(unknown, dtype=torch.bool)), dim=-1)
+        blocks, coupled = list(model.blocks()), True
     x = torch.cat((given, unknown) if clamped == "visible" else (unknown, given), dim=-1)
-    blocks = _free_blocks(model, clamped)
-    coupled = any(bool(_among(block.neighbours, n_visible, clamped).any()) for block in blocks)
     if not coupled:
         for block in blocks:
-            x[..., block.units] = torch.sigmoid(block.field(x))
+            x[..., block.units] = block.kind.mean(block.field(x))
         change = given.new_zeros(given.shape[:-2])
-        return MeanFieldSolution(x[..., free], change, change < tolerance, 1)
+        return MeanFieldSolution(x[..., free], change, change < tolerance, 1, x[..., :n_visible])
     change = given.new_full(given.shape[:-1], torch.inf)
     n_iterations = 0
     for n_iterations in range(1, max_iterations + 1):  # noqa: B007
@@ -62,20 +75,20 @@ def mean_field(
         now = torch.zeros_like(change)
         for block in blocks:
             old = x[..., block.units]
-            mean = torch.where(moves.unsqueeze(-1), torch.sigmoid(block.field(x)), old)
+            may_move = moves.unsqueeze(-1) if fixed is None else moves.unsqueeze(-1) & ~fixed[..., block.units]
+            mean = torch.where(may_move, block.kind.mean(block.field(x)), old)
             now = torch.maximum(now, (mean - old).abs().amax(-1))
             x[..., block.units] = mean
         change = torch.where(moves, now, change)
         if not bool((change >= tolerance).any()):
             break
     largest = change.amax(-1)
-    return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations)
+    return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations, x[..., :n_visible])
 
 
 def free_energy_of_means(model: EnergyModel, v: Visible, h: Hidden) -> PerState:
     r"""``E(v, m) - \sum_i H(m_i)`` of given means m of the hidden units: an upper bound of F(v)."""
-    negative_entropy: Tensor = (torch.special.xlogy(h, h) + torch.special.xlogy(1 - h, 1 - h)).sum(-1)
-    return model.energy(v, h) + negative_entropy
+    return model.energy(v, h) + model.hidden.negative_entropy(h)
 
 
 def hidden_blocks(model: EnergyModel) -> list[Block]:
@@ -95,5 +108,6 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
         keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
         if len(keep):
             weight, bias = block.weight.index_select(-2, keep), block.bias.index_select(-1, keep)
-            found.append(block._replace(units=block.units[keep], weight=weight, bias=bias))
+            kind = block.kind.select(keep)
+            found.append(block._replace(units=block.units[keep], weight=weight, bias=bias, kind=kind))
     return found

@@ -1,38 +1,42 @@
-"""The Bernoulli restricted Boltzmann machine."""
+"""The restricted Boltzmann machine, of units of any kind."""
 
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
-from memcomp_lightning.enumeration import binary_states
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Initialiser, initial
-from memcomp_lightning.models.machine import Machine
+from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
+from memcomp_lightning.models.units import Units, all_states
 from memcomp_lightning.types import Configurations
 
 
 class RBM(Machine):
-    r"""A model of binary data: visible units hold it, hidden units explain it, couplings join the two layers only.
+    r"""A model of data: visible units hold it, hidden units explain it, couplings join the two layers only.
 
-    .. math:: E(v, h) = -\sum_{ij} w_{ij} h_i v_j - \sum_j b_j v_j - \sum_i c_i h_i
+    .. math:: E(v, h) = -\sum_{ij} w_{ij} h_i v_j - \sum_j b_j v_j - \sum_i c_i h_i - \log \mu(v) - \log \mu(h)
 
-    (Manukian et al. 2019, eq. 3.) Real values in [0, 1] stand for the probabilities of independent units:
-    the energy is then the expected one, because E is linear in each unit.
+    (Manukian et al. 2019, eq. 3.) The kinds of units say what v and h may be and give the measures
+    :math:`\mu`, which are 1 for units in {0, 1}, spins and categories. Where they are 1, values in between stand for
+    the means of independent units: the energy is then the expected one, because E is linear in each unit.
 
     Attributes:
-        weight: ``(*replicas, n_hidden, n_visible)``.
+        weight: ``(*replicas, n_hidden, n_visible)``; of categorical units there is a column for each state.
         b: Visible bias, ``(*replicas, n_visible)``.
         c: Hidden bias, ``(*replicas, n_hidden)``.
+        visible: The kind of the visible units.
+        hidden: The kind of the hidden units.
 
     Args:
-        n_visible: Number of visible units, >= 1.
-        n_hidden: Number of hidden units, >= 1.
+        n_visible: Number of visible units in {0, 1}, >= 1; None where ``visible`` says it.
+        n_hidden: Number of hidden units in {0, 1}, >= 1; None where ``hidden`` says it.
+        visible: Kind of the visible units, see :mod:`memcomp_lightning.models.units`.
+        hidden: Kind of the hidden units. Real ones ask for visible units that are not.
         replicas: Leading axes of independent machines that share every call.
         weight_init: Draws the weights; the biases start at zero.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
@@ -40,28 +44,36 @@ class RBM(Machine):
     >>> rbm = RBM(n_visible=3, n_hidden=2)
     >>> rbm.energy(torch.zeros(5, 3), torch.zeros(5, 2)).shape
     torch.Size([5])
+    >>> from memcomp_lightning.models.units import Categorical, Spin
+    >>> RBM(visible=Categorical(53, q=21), hidden=Spin(10)).weight.shape
+    torch.Size([10, 1113])
     """
 
     @torch.inference_mode(False)
     def __init__(
         self,
-        n_visible: int,
-        n_hidden: int,
+        n_visible: int | None = None,
+        n_hidden: int | None = None,
         *,
+        visible: Units | None = None,
+        hidden: Units | None = None,
         replicas: tuple[int, ...] = (),
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
     ) -> None:
-        super().__init__()
-        require_count("n_visible", n_visible)
-        require_count("n_hidden", n_hidden)
-        weight = initial((*replicas, n_hidden, n_visible), weight_init, generator)
+        visible, hidden = units_of("visible", n_visible, visible), units_of("hidden", n_hidden, hidden)
+        both = visible.real and hidden.real
+        kinds = f"{type(visible).__name__} and {type(hidden).__name__}"
+        allowed = "real units in one layer at most, as Z may be infinite otherwise"
+        require(not both, "kinds of visible and hidden units", kinds, allowed)
+        super().__init__(visible.for_replicas(replicas), hidden.for_replicas(replicas))
+        weight = initial((*replicas, hidden.n, visible.n), weight_init, generator)
         self.weight = nn.Parameter(weight)
-        self.b = nn.Parameter(weight.new_zeros(*replicas, n_visible))
-        self.c = nn.Parameter(weight.new_zeros(*replicas, n_hidden))
+        self.b = nn.Parameter(weight.new_zeros(*replicas, visible.n))
+        self.c = nn.Parameter(weight.new_zeros(*replicas, hidden.n))
 
-    def energy(self, v: Visible, h: Hidden) -> PerState:
-        """E(v, h) of each configuration (eq. 3)."""
+    def tempered_energy(self, v: Visible, h: Hidden) -> PerState:
+        """E(v, h) without the measures (eq. 3)."""
         hidden_part = (self.hidden_field(v) * h).sum(-1)
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
 
@@ -86,28 +98,38 @@ class RBM(Machine):
         return -(coupled + biases)
 
     def free_energy(self, v: Visible) -> PerState:
-        r"""F(v) = -b.v - \sum_i softplus(W v + c)_i, so that p(v) = exp(-F(v)) / Z."""
-        return -F.softplus(self.hidden_field(v)).sum(-1) - (v * self.b.unsqueeze(-2)).sum(-1)
+        r"""F(v) = -b.v - log mu(v) - \sum_i A(W v + c)_i, so that p(v) = exp(-F(v)) / Z; A is the units' cumulant."""
+        free = -self.hidden.cumulant(self.hidden_field(v)).sum(-1) - (v * self.b.unsqueeze(-2)).sum(-1)
+        return free if self.visible.linear else free + self.visible.energy(v)
 
     def hidden_free_energy(self, h: Hidden) -> PerState:
-        r"""F(h) = -c.h - \sum_j softplus(W^T h + b)_j, so that p(h) = exp(-F(h)) / Z."""
-        return -F.softplus(self.visible_field(h)).sum(-1) - (h * self.c.unsqueeze(-2)).sum(-1)
+        r"""F(h) = -c.h - log mu(h) - \sum_j A(W^T h + b)_j, so that p(h) = exp(-F(h)) / Z."""
+        free = -self.visible.cumulant(self.visible_field(h)).sum(-1) - (h * self.c.unsqueeze(-2)).sum(-1)
+        return free if self.hidden.linear else free + self.hidden.energy(h)
 
     def hidden_field(self, v: Visible) -> Hidden:
-        """W v + c, the log odds of each hidden unit."""
+        """W v + c, the fields of the hidden units: the log odds of units in {0, 1}."""
         return affine(v, self.weight, self.c)
 
     def visible_field(self, h: Hidden) -> Visible:
-        """W^T h + b, the log odds of each visible unit."""
+        """W^T h + b, the fields of the visible units."""
         return affine(h, self.weight.mT, self.b)
 
     def hidden_mean(self, v: Visible, *, beta: float | Tensor = 1.0) -> Hidden:
-        """p(h = 1 | v) at inverse temperature ``beta`` (eq. 7), a number or ``(*replicas, n, 1)``."""
-        return torch.sigmoid(_scaled(self.hidden_field(v), beta))
+        """E[h | v] at inverse temperature ``beta`` (eq. 7), a number or ``(*replicas, n, 1)``."""
+        return self.hidden.mean(scaled(self.hidden_field(v), beta))
 
     def visible_mean(self, h: Hidden, *, beta: float | Tensor = 1.0) -> Visible:
-        """p(v = 1 | h) at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
-        return torch.sigmoid(_scaled(self.visible_field(h), beta))
+        """E[v | h] at inverse temperature ``beta`` (eq. 8), a number or ``(*replicas, n, 1)``."""
+        return self.visible.mean(scaled(self.visible_field(h), beta))
+
+    def draw_hidden(self, v: Visible, *, beta: float | Tensor = 1.0, generator: Generator) -> Hidden:
+        """Draw h given v, at inverse temperature ``beta``."""
+        return self.hidden.sample(scaled(self.hidden_field(v), beta), generator=generator)
+
+    def draw_visible(self, h: Hidden, *, beta: float | Tensor = 1.0, generator: Generator) -> Visible:
+        """Draw v given h, at inverse temperature ``beta``."""
+        return self.visible.sample(scaled(self.visible_field(h), beta), generator=generator)
 
     @property
     def classes(self) -> list[Tensor]:
@@ -118,28 +140,48 @@ class RBM(Machine):
     def blocks(self) -> list[Block]:
         """The visible and the hidden units, with their couplings."""
         first, second = self.classes
-        return [Block(first, second, self.weight.mT, self.b), Block(second, first, self.weight, self.c)]
+        return [
+            Block(first, second, self.weight.mT, self.b, self.visible),
+            Block(second, first, self.weight, self.c, self.hidden),
+        ]
 
     def chains(self) -> TwoLayerChains:
         """Gibbs chains of the visible units, at the present parameters."""
         return TwoLayerChains(self)
 
     @property
-    def n_enumerated(self) -> int:
-        """Number of units whose states exact computations enumerate: those of the smaller layer."""
-        return min(self.n_visible, self.n_hidden)
+    def enumerates_hidden(self) -> bool:
+        """Whether exact computations enumerate the hidden layer: the one of fewer states, of those that have a list."""
+        if self.visible.real or self.hidden.real:
+            return self.visible.real
+        return self.hidden.n_states < self.visible.n_states
+
+    @property
+    def n_enumerated(self) -> float:
+        """Number of bits that exact computations enumerate: log2 of the states of the smaller layer."""
+        return log2_states(self.hidden if self.enumerates_hidden else self.visible)
+
+    def outside_largest_class(self) -> tuple[Block, Tensor, Units]:
+        """The larger layer, the units of the smaller one, and what these are."""
+        visible, hidden = self.blocks()
+        return (visible, hidden.units, self.hidden) if self.enumerates_hidden else (hidden, visible.units, self.visible)
 
     @torch.no_grad()
     def all_configurations(self) -> Configurations:
-        """All states of the smaller layer with their probabilities as weights, the other layer by its means."""
-        hidden_first = self.n_hidden < self.n_visible
-        states = binary_states(self.n_enumerated, like=self.b)
+        """All states of the smaller layer with their probabilities as weights, the other layer by its means.
+
+        Of real units there are points that have these means and the right variances.
+        """
+        layer = self.hidden if self.enumerates_hidden else self.visible
+        states = all_states(layer, self.b)
         states = states.expand(*self.replicas, *states.shape)
-        free_energy = self.hidden_free_energy(states) if hidden_first else self.free_energy(states)
+        free_energy = self.hidden_free_energy(states) if self.enumerates_hidden else self.free_energy(states)
         weight = torch.softmax(-free_energy.double(), dim=-1).to(states.dtype)
-        if hidden_first:
-            return Configurations(self.visible_mean(states), states, weight)
-        return Configurations(states, self.hidden_mean(states), weight)
+        if self.enumerates_hidden:
+            found = [Configurations(v, states, weight) for v in self.visible.points(self.visible_field(states))]
+        else:
+            found = [Configurations(states, h, weight) for h in self.hidden.points(self.hidden_field(states))]
+        return joined(found)
 
     def quadratic_form(self) -> QuadraticForm:
         """The weights as couplings of all hidden to all visible units, and both biases."""
@@ -150,10 +192,10 @@ class RBM(Machine):
         return TwoLayers(self, None)
 
     def forward(self, v: Visible) -> Hidden:
-        """The layer as part of a feed-forward network: p(h = 1 | v)."""
+        """The layer as part of a feed-forward network: E[h | v]."""
         return self.hidden_mean(v)
 
 
-def _scaled(field: Tensor, beta: float | Tensor) -> Tensor:
+def scaled(field: Tensor, beta: float | Tensor) -> Tensor:
     """Field times beta, without a pass over memory in the usual case."""
     return field if isinstance(beta, float) and beta == 1.0 else beta * field

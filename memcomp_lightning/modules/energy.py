@@ -231,8 +231,7 @@ class EnergyPretraining(StageModule):
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
         with torch.no_grad():
-            v = self.phase.visible_of(batch.v)
-            positive, inferred = self.phase.positive(v, self.streams["positive_phase"])
+            v, (positive, inferred) = self.phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
         processes = _OfTrainer(self.trainer, self.device) if self.trainer.world_size > 1 else Processes()
         step = EnergyStep(sampler=self.sampler, centring=self.centring, processes=processes)
@@ -243,6 +242,7 @@ class EnergyPretraining(StageModule):
         gap_so_far = self._gap + batch.share * gap.detach()
         self._gap = gap_so_far
         if batch.closes_step:
+            self.model.project()
             self.energy_gaps[self.layer] = processes.mean(gap_so_far)
             self._state, self._gap = self._state.after_update(), 0.0
         return {

@@ -6,7 +6,7 @@ from memcomp_lightning.problems.files.formats import FORMATS
 from memcomp_lightning.problems.files.numbers import in_full
 from memcomp_lightning.problems.files.objective import Score
 from memcomp_lightning.problems.files.source import ProblemFileError
-from memcomp_lightning.problems.from_model import from_model
+from memcomp_lightning.problems.from_model import constrained_from_model, from_model
 from memcomp_lightning.problems.graph import Bipartite, EdgeList, Graph
 from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, as_qubo, from_qubo, to_qubo
 from memcomp_lightning.problems.problem import Problem, is_problem_file, read_problem
@@ -27,6 +27,7 @@ __all__ = [
     "WeightedMaxSat",
     "as_qubo",
     "clause",
+    "constrained_from_model",
     "exactly",
     "from_model",
     "from_qubo",

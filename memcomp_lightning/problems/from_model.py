@@ -3,15 +3,24 @@
 from typing import TYPE_CHECKING
 
 from memcomp_lightning.arrays import Array, namespace
+from memcomp_lightning.problems.constrained import Constrained, exactly
 from memcomp_lightning.problems.graph import Bipartite, EdgeList, Graph
 from memcomp_lightning.problems.qubo import Qubo
 
 if TYPE_CHECKING:
     from memcomp_lightning.models.base import EnergyModel
+    from memcomp_lightning.models.bit_form import BitForm
 
 
 def from_model(model: "EnergyModel") -> Qubo:
-    """Return the problem whose energy at x = (v, h) is E(v, h) of the model, one problem a replica.
+    """Return a model's energy as a QUBO, one problem a replica.
+
+    Of units in {0, 1} the energy at x = (v, h) is E(v, h). Spins are written in bits, the states of a category are a bit
+    each, of which exactly one has to be 1 (:func:`constrained_from_model` says so), and real units are integrated
+    out: ``models.bit_form`` has the details, and ``models.read_bits`` reads answers.
+
+    Raises:
+        SettingError: The model has units without a form in bits.
 
     >>> import torch
     >>> from memcomp_lightning.models import RBM
@@ -19,10 +28,23 @@ def from_model(model: "EnergyModel") -> Qubo:
     >>> from_model(rbm).energy(torch.ones(1, 5)).allclose(rbm.energy(torch.ones(1, 3), torch.ones(1, 2)).double())
     True
     """
-    pairs, coupling, bias = model.quadratic_form()
-    layers = Bipartite(n_first=model.n_visible, n_second=model.n_hidden)
-    graph: Graph = layers if pairs is None else EdgeList(n=bias.shape[-1], pairs=pairs)
-    return from_quadratic_form(graph, coupling.detach(), bias.detach())
+    return from_bit_form(model.in_bits())
+
+
+def constrained_from_model(model: "EnergyModel") -> Qubo | Constrained:
+    """The same problem, with the constraint of each categorical site as a hard one where there are any."""
+    form = model.in_bits()
+    constraints = [exactly(1, group) for group in form.groups]
+    return Constrained.of(from_bit_form(form), constraints) if constraints else from_bit_form(form)
+
+
+def from_bit_form(form: "BitForm") -> Qubo:
+    """The problem of an energy in bits."""
+    pairs, coupling, bias = form.form
+    n = bias.shape[-1]
+    layers = Bipartite(n_first=form.n_first, n_second=n - form.n_first)
+    graph: Graph = layers if pairs is None else EdgeList(n=n, pairs=pairs)
+    return Qubo(graph, -coupling.detach(), -bias.detach(), form.offset)
 
 
 def from_quadratic_form(graph: Graph, coupling: Array, bias: Array) -> Qubo:

@@ -13,7 +13,7 @@ from memcomp_lightning.arrays import as_array
 from memcomp_lightning.errors import SettingError, require
 from memcomp_lightning.problems.constrained import Constrained
 from memcomp_lightning.problems.files.objective import sum_as_qubo
-from memcomp_lightning.problems.from_model import from_model
+from memcomp_lightning.problems.from_model import constrained_from_model
 from memcomp_lightning.problems.maxsat import WeightedMaxSat
 from memcomp_lightning.problems.problem import Problem, read_problem
 from memcomp_lightning.problems.qubo import Qubo
@@ -61,7 +61,7 @@ class Labelled:
         if isinstance(given, tuple) and len(given) == 2:
             return _of_spins(*given)
         if hasattr(given, "quadratic_form"):
-            return Labelled(problem=from_model(given))
+            return Labelled(problem=constrained_from_model(given))
         if hasattr(given, "vartype") and hasattr(given, "quadratic"):
             from memcomp_lightning.problems.bqm import from_bqm
 

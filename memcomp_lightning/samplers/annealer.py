@@ -10,7 +10,9 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.models.bit_form import read_bits
+from memcomp_lightning.problems import Qubo
+from memcomp_lightning.problems.from_model import from_bit_form
 from memcomp_lightning.solvers.dimod import check_parameters, problem_at, reads_of, sample_set
 from memcomp_lightning.types import Configurations, NegativePhase
 
@@ -58,7 +60,14 @@ class AnnealerSamples:
         require(0 < self.rate <= 1, "rate", self.rate, "a number in (0, 1]")
 
     def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> AnnealerState:
-        """Begin with the given inverse temperature, or 1."""
+        """Begin with the given inverse temperature, or 1.
+
+        Raises:
+            SettingError: Categorical or real units, which an annealer does not sample.
+        """
+        two_valued = not model.visible.real and not model.in_bits().groups
+        allowed = "units of two values, {0, 1} or spins, for an annealer"
+        require(two_valued, "visible units", type(model.visible).__name__, allowed)
         beta = 1.0 if self.beta == "estimate" else float(self.beta)
         return AnnealerState(torch.full(model.replicas, beta, dtype=model.b.dtype, device=model.b.device))
 
@@ -67,7 +76,8 @@ class AnnealerSamples:
         self, model: EnergyModel, state: AnnealerState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[AnnealerState]:
         """Return one configuration a read."""
-        qubo = from_model(model)
+        form = model.in_bits()
+        qubo = from_bit_form(form)
         scale = (1 / state.beta).reshape(*state.beta.shape, *[1] * len(qubo.graph.edge_shape))
         given = Qubo(qubo.graph, qubo.coupling * scale, qubo.linear / state.beta.unsqueeze(-1), qubo.offset)
         problems = [problem_at(given, index) for index in range(max(1, given.offset.numel()))]
@@ -83,8 +93,7 @@ class AnnealerSamples:
         if all("chain_break_fraction" in answer.record.dtype.names for answer in answers):
             broken = [float(answer.record.chain_break_fraction.mean()) for answer in answers]
             info["chain_break_fraction"] = torch.tensor(broken).to(beta).view(model.replicas)
-        v, h = x[..., : model.n_visible], x[..., model.n_visible :]
-        return NegativePhase(Configurations(v, h), AnnealerState(beta), info)
+        return NegativePhase(read_bits(model, form, x), AnnealerState(beta), info)
 
 
 def maximum_pseudo_likelihood_beta(

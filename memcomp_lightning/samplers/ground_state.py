@@ -8,17 +8,24 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice, require_parts
 from memcomp_lightning.models.base import EnergyModel, as_two_layers
-from memcomp_lightning.problems.from_model import from_model
-from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.models.bit_form import descend, read_bits, with_real_spread
+from memcomp_lightning.problems.constrained import Constrained, exactly
+from memcomp_lightning.problems.from_model import from_bit_form
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
+from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
+
+MOST_TURNS = 2
+"""Turns of penalties for categorical units: what still breaks a constraint is mended, and an update cannot wait."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundState:
     """Takes the state of lowest energy as the negative phase (Manukian et al. 2019, section 3.2).
 
-    Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model.
+    Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model. Of
+    categorical units it gets a bit a state with a hard constraint a site, and the answer descends to where no layer
+    alone can improve it. Real units are integrated out.
 
     Attributes:
         solver: Finds low energies of the QUBO.
@@ -43,42 +50,58 @@ class GroundState:
             require(records, "solver", kind, allowed, remedy)
 
     def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> NoState:
-        """Nothing to remember: every update solves a new problem."""
+        """Nothing to remember: every update solves a new problem.
+
+        Raises:
+            SettingError: The model has units without a form in bits, or sites whose constraints a trajectory breaks.
+        """
+        form = model.in_bits()
+        allowed = "'best' for categorical units: states on the way to an answer break their constraints"
+        require(self.readout == "best" or not form.groups, "readout", self.readout, allowed)
         return NoState()
 
     @torch.no_grad()
     def sample(
         self, model: EnergyModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
-        """Return x* or the weighted trajectory."""
-        problem, order = problem_of(model)
-        solution = self.solver.minimise(problem, generator=generator)
+        """Return x* or the weighted trajectory; real units stand at two points around their means given the others."""
+        posed, order = posed_as(model)
+        form = posed.in_bits()
+        qubo = from_bit_form(form)
+        if form.groups:
+            constrained = Constrained.of(qubo, [exactly(1, group) for group in form.groups])
+            solution = PenaltyLoop(solver=self.solver, n_turns=MOST_TURNS).minimise(constrained, generator=generator)
+        else:
+            solution = self.solver.minimise(qubo, generator=generator)
         if self.readout == "best":
-            x, weight = solution.best.unsqueeze(-2), None
+            bits, weight = solution.best.unsqueeze(-2), None
         else:
             visited = solution.trajectory
             if visited is None:
                 raise ValueError(
                     "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
                 )
-            x = visited.assignments.flatten(-3, -2).to(model.b.dtype)
+            bits = visited.assignments.flatten(-3, -2)
             weight = visited.weights().flatten(-2).to(model.b.dtype)
+        found = read_bits(posed, form, bits)._replace(weight=weight)
+        if form.groups:
+            found = descend(posed, found)
+        v, h, weight = with_real_spread(posed, found)
         if order is not None:
-            x = x[..., order]
-        v, h = x.split((model.n_visible, model.n_hidden), dim=-1)
+            v, h = torch.cat((v, h), dim=-1)[..., order].split((model.n_visible, model.n_hidden), dim=-1)
         return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
 
 
-def problem_of(model: EnergyModel) -> tuple[Qubo, Tensor | None]:
-    """The problem of a model, and where in its assignments the model's units are; None if in their places.
+def posed_as(model: EnergyModel) -> tuple[EnergyModel, Tensor | None]:
+    """The model that a solver is given, and where in its units the model's own are; None if in their places.
 
     A machine whose couplings fill most of the matrix between two classes, a DBM, is posed as an RBM: solvers are
     much faster on a matrix than on a list of pairs.
     """
     pairs, classes = model.quadratic_form().pairs, model.classes
     if pairs is not None and len(classes) == 2 and len(pairs) > 0.5 * len(classes[0]) * len(classes[1]):
-        return from_model(as_two_layers(model).rbm), torch.cat(list(classes)).argsort()
-    return from_model(model), None
+        return as_two_layers(model).rbm, torch.cat(list(classes)).argsort()
+    return model, None
 
 
 def _diagnostics(solution: QuboSolution) -> dict[str, Tensor]:

@@ -65,9 +65,10 @@ class ModeAssisted:
 
     .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
 
-    with the mean energy of all joint states :math:`\bar E = E(1/2, 1/2)`: the depth of the ground state as a share
-    of the largest for couplings of size one. In a model of any connectivity the number of couplings and
-    biases, plus one, stands for :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM. The scaled
+    with the mean energy of all joint states :math:`\bar E`, that of units without fields: E(1/2, 1/2) for units in
+    {0, 1}. It is the depth of the ground state as a share of the largest for couplings of size one. In a model of any
+    connectivity the number of couplings and biases, plus one, stands for
+    :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM; a categorical unit counts once. The scaled
     update is written as a negative phase: x* has the weight g, the positive phase keeps 1 - g. One coin serves all
     replicas, so that a ground state is computed only when it is used. The coin is tossed and counted once a call:
     give all images of an update at once.
@@ -128,8 +129,22 @@ class ModeAssisted:
 
 def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
     """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1]; the lowest energy counts."""
-    half_v, half_h = (torch.full_like(x[..., :1, :], 0.5) for x in (mode.v, mode.h))
-    depth = model.energy(half_v, half_h).squeeze(-1) - model.energy(mode.v, mode.h).amin(-1)
-    n_terms = 1 + sum(parameter.numel() for parameter in model.parameters()) // max(1, math.prod(model.replicas))
-    scale: Tensor = depth / (4 * n_terms)
+    layers = (model.visible, mode.v), (model.hidden, mode.h)
+    free_v, free_h = (units.mean(torch.zeros_like(x[..., :1, :])) for units, x in layers)
+    energy = model.tempered_energy(mode.v, mode.h).amin(-1)
+    depth = model.tempered_energy(free_v, free_h).squeeze(-1) - energy
+    scale: Tensor = depth / (4 * _n_terms(model))
     return scale.clamp(0.0, 1.0)
+
+
+def _n_terms(model: EnergyModel) -> int:
+    """Number of coupled pairs of sites, of biases, and one more."""
+    visible, hidden, pairs = model.visible, model.hidden, model.quadratic_form().pairs
+    n_sites = visible.n_sites + hidden.n_sites
+    if pairs is None:
+        return 1 + n_sites + visible.n_sites * hidden.n_sites
+    if n_sites == model.n_units:
+        return 1 + n_sites + len(pairs)
+    site_of = torch.cat((visible.site_of(), hidden.site_of() + visible.n_sites)).to(pairs.device)
+    sites = site_of[pairs]
+    return 1 + n_sites + len(torch.unique(sites[:, 0] * n_sites + sites[:, 1]))

@@ -136,7 +136,7 @@ class PhaseTraining:
         state, phase = self._state, self.phase
         for batch in batches:
             with torch.no_grad():
-                found = phase.positive(phase.visible_of(batch.v), self.streams["positive_phase"])
+                _, found = phase.positive_of(batch, self.streams["positive_phase"])
                 positive = weighted(found.configurations, batch.weight)
             gap, _, state = self.step.contrast(
                 phase.model, positive, state, generator=self.streams["negative_phase"]
@@ -144,6 +144,7 @@ class PhaseTraining:
             (batch.share * gap.sum()).backward()
             if batch.closes_step:
                 self.optimizer.step()
+                phase.model.project()
                 self.optimizer.zero_grad()
                 state = state.after_update()
         self.passes_done += 1

@@ -4,5 +4,13 @@ from memcomp_lightning.samplers.positive.base import PositivePhase, PositivePhas
 from memcomp_lightning.samplers.positive.clamped_gibbs import ClampedGibbs
 from memcomp_lightning.samplers.positive.exact import ExactPosterior
 from memcomp_lightning.samplers.positive.mean_field import MeanField
+from memcomp_lightning.samplers.positive.missing import posterior_of
 
-__all__ = ["ClampedGibbs", "ExactPosterior", "MeanField", "PositivePhase", "PositivePhaseSampler"]
+__all__ = [
+    "ClampedGibbs",
+    "ExactPosterior",
+    "MeanField",
+    "PositivePhase",
+    "PositivePhaseSampler",
+    "posterior_of",
+]

@@ -1,4 +1,4 @@
-"""What a sampler of the positive phase must offer; models need one if their hidden units are coupled."""
+"""What a sampler of the positive phase must offer: for coupled hidden units, and for data with missing values."""
 
 from typing import NamedTuple, Protocol
 
@@ -23,5 +23,11 @@ class PositivePhase(NamedTuple):
 class PositivePhaseSampler(Protocol):
     """Supplies the expectation over hidden units with the data clamped."""
 
-    def sample(self, model: EnergyModel, v: Tensor, *, generator: Generator) -> PositivePhase:
-        """Return configurations for data ``(*replicas, n, n_visible)`` in [0, 1]."""
+    def sample(
+        self, model: EnergyModel, v: Tensor, *, observed: Tensor | None = None, generator: Generator
+    ) -> PositivePhase:
+        """Return configurations for data ``(*replicas, n, n_visible)``, those of one row side by side.
+
+        Where ``observed``, a mask of this shape, is False, the value is missing: whatever stands there is not read,
+        and the configurations have values of these units that stand for p(missing, h | observed).
+        """

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field
+from memcomp_lightning.models.units import all_states
 from memcomp_lightning.samplers.positive.base import PositivePhase
 from memcomp_lightning.types import Configurations
 
@@ -27,18 +29,35 @@ class ExactPosterior:
         require(self.max_units <= 16, "max_units", self.max_units, "an integer from 1 to 16")
 
     @torch.no_grad()
-    def sample(self, model: EnergyModel, v: Tensor, *, generator: Generator) -> PositivePhase:
+    def sample(
+        self, model: EnergyModel, v: Tensor, *, observed: Tensor | None = None, generator: Generator
+    ) -> PositivePhase:
         """Return all configurations, those of an image with weights that add up to one.
 
+        What is missing is summed: it has its means given each hidden state, real units two points.
+
         Raises:
-            SettingError: The model has more hidden units.
+            SettingError: The model has more hidden units, or couples visible ones and values are missing.
         """
-        n = model.n_hidden
+        n = log2_states(model.hidden)
         require(n <= self.max_units, "number of hidden units", n, f"at most max_units = {self.max_units}")
-        h = binary_states(n, like=v)
-        n_images, n_states = v.shape[-2], len(h)
-        v = v.repeat_interleave(n_states, dim=-2)
-        h = h.repeat(n_images, 1).expand(*v.shape[:-1], n)
-        log_weight = -model.energy(v, h).double().unflatten(-1, (n_images, n_states))
-        weight = torch.softmax(log_weight, dim=-1).flatten(-2).to(v.dtype)
+        states = all_states(model.hidden, v)
+        n_images, n_states = v.shape[-2], len(states)
+        wide = v.repeat_interleave(n_states, dim=-2)
+        h = states.repeat(n_images, 1).expand(*wide.shape[:-1], model.n_hidden)
+        if observed is None:
+            log_weight = -model.energy(wide, h).double().unflatten(-1, (n_images, n_states))
+            weight = torch.softmax(log_weight, dim=-1).flatten(-2).to(v.dtype)
+            return PositivePhase(Configurations(wide, h, weight), {})
+        states = states.expand(*model.replicas, *states.shape)
+        log_weight = log_weight_of_hidden(model, v, observed, states).double()
+        weight, parts = torch.softmax(log_weight, dim=-1).to(v.dtype), []
+        points = model.visible.points(visible_field(model, states))
+        for values in points:
+            filled = torch.where(observed.unsqueeze(-2), v.unsqueeze(-2), values.unsqueeze(-3))
+            parts.append(filled)
+        # Points of one image side by side, as those of its states.
+        v = torch.stack(parts, dim=-2).flatten(-4, -2)
+        h = h.repeat_interleave(len(points), dim=-2)
+        weight = (weight / len(points)).flatten(-2).repeat_interleave(len(points), dim=-1)
         return PositivePhase(Configurations(v, h, weight), {})

@@ -15,6 +15,7 @@ from memcomp_lightning.errors import require_parts
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.samplers import NegativePhaseSampler, PositivePhase
 from memcomp_lightning.samplers.base import require_state
+from memcomp_lightning.types import Batch
 
 
 def unchanged(v: Tensor) -> Tensor:
@@ -30,17 +31,29 @@ class Phase:
         name: What it is called in tables: "layer 1".
         tag: What follows the name of the stage in the tags of TensorBoard: "layer1"; nothing if empty.
         model: The model in training.
-        positive: Maps visible states ``(*replicas, n, n_visible)`` and a random stream to the positive phase.
+        positive: Maps visible states ``(*replicas, n, n_visible)``, a mask of those that are observed (None is all)
+            and a random stream to the positive phase.
         visible_of: Maps images to visible states.
         images_of: Maps visible states to images, for pictures.
+        complete: Draws what is missing of images, ``(v, observed, generator)``, before ``visible_of``; None where the
+            positive phase knows the mask.
     """
 
     name: str
     tag: str
     model: EnergyModel
-    positive: Callable[[Tensor, Generator], PositivePhase]
+    positive: Callable[[Tensor, Tensor | None, Generator], PositivePhase]
     visible_of: Callable[[Tensor], Tensor] = unchanged
     images_of: Callable[[Tensor], Tensor] = unchanged
+    complete: Callable[[Tensor, Tensor, Generator], Tensor] | None = None
+
+    def positive_of(self, batch: Batch, generator: Generator) -> tuple[Tensor, PositivePhase]:
+        """What the model sees of a batch, and its positive phase."""
+        v, observed = batch.v, batch.observed
+        if observed is not None and self.complete is not None:
+            v, observed = self.complete(v, observed, generator), None
+        v = self.visible_of(v)
+        return v, self.positive(v, observed, generator)
 
 
 class PretrainingStage(Protocol):

@@ -31,7 +31,11 @@ class Boltzmann:
 
 
 def sampled(
-    positive: PositivePhaseSampler, model: BoltzmannMachine, v: Tensor, generator: Generator
+    positive: PositivePhaseSampler,
+    model: BoltzmannMachine,
+    v: Tensor,
+    observed: Tensor | None,
+    generator: Generator,
 ) -> PositivePhase:
     """The positive phase by a sampler."""
-    return positive.sample(model, v, generator=generator)
+    return positive.sample(model, v, observed=observed, generator=generator)

@@ -6,7 +6,8 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.samplers import PositivePhase, positive_phase
+from memcomp_lightning.samplers import ClampedGibbs, PositivePhase, positive_phase
+from memcomp_lightning.samplers.positive import posterior_of
 from memcomp_lightning.training.stages.base import Phase
 
 
@@ -42,8 +43,16 @@ def _phase(dbn: DBN, layer: int) -> Phase:
         positive=partial(_hidden_means, dbn[layer]),
         visible_of=partial(dbn.visible_of, layer),
         images_of=partial(dbn.images_of, layer),
+        complete=partial(_drawn, dbn[0]) if layer else None,
     )
 
 
-def _hidden_means(rbm: RBM, v: Tensor, generator: Generator) -> PositivePhase:
-    return PositivePhase(positive_phase(rbm, v), {})
+def _hidden_means(rbm: RBM, v: Tensor, observed: Tensor | None, generator: Generator) -> PositivePhase:
+    if observed is None:
+        return PositivePhase(positive_phase(rbm, v), {})
+    return posterior_of(rbm).sample(rbm, v, observed=observed, generator=generator)
+
+
+def _drawn(rbm: RBM, v: Tensor, observed: Tensor, generator: Generator) -> Tensor:
+    """Data with draws given the observed values where some are missing: what the layers above see."""
+    return ClampedGibbs().sample(rbm, v, observed=observed, generator=generator).configurations.v

@@ -1,0 +1,177 @@
+"""A model's energy in bits, whatever its units are: what solvers of QUBOs are given, and how answers are read."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from memcomp_lightning.models.base import EnergyModel, QuadraticForm
+from memcomp_lightning.models.units import Bernoulli, Bits
+from memcomp_lightning.types import Configurations
+
+
+class BitForm(NamedTuple):
+    r"""``E = offset + form`` over the bits y, with x = low + width y for the entries that have bits.
+
+    Real units are integrated out exactly: what is left is :math:`-\log \int e^{-E} dv` over theirs, a quadratic form
+    of the units that they are coupled to.
+
+    Attributes:
+        form: Couplings and biases of the bits, those of visible entries first; ``pairs`` is None if each hidden bit
+            is coupled to each visible one and there are no other couplings.
+        offset: ``(*replicas,)``.
+        n_first: Bits of visible entries.
+        at: Entry of x = (v, h) that each bit stands for, ``(n_bits,)``.
+        low: Values where bits are 0, ``(n_bits,)``.
+        width: What they gain where bits are 1, ``(n_bits,)``.
+        groups: Bits of which exactly one is 1.
+    """
+
+    form: QuadraticForm
+    offset: Tensor
+    n_first: int
+    at: Tensor
+    low: Tensor
+    width: Tensor
+    groups: Sequence[Sequence[int]]
+
+
+@torch.no_grad()
+def bit_form(model: EnergyModel) -> BitForm:
+    """Write the energy of a model in bits.
+
+    Raises:
+        SettingError: The model has units without a form in bits.
+    """
+    visible, hidden = model.visible.bits(), model.hidden.bits()
+    at = torch.cat((visible.at, hidden.at + model.n_visible)).to(model.b.device)
+    low, width = (torch.cat(pair).to(model.b) for pair in ((visible.low, hidden.low), (visible.width, hidden.width)))
+    n_first, shift = len(visible.at), len(visible.at)
+    groups = [*visible.groups, *([bit + shift for bit in group] for group in hidden.groups)]
+    zero = model.b.new_zeros(model.replicas)
+    if type(model.visible) is Bernoulli and type(model.hidden) is Bernoulli:
+        return BitForm(model.quadratic_form(), zero, n_first, at, low, width, groups)
+    form = model.quadratic_form()
+    if form.pairs is None and not model.visible.real:
+        changed, offset = _of_layers(form, visible, hidden)
+    else:
+        changed, offset = _of_pairs(model, form, at, low, width)
+    return BitForm(changed, offset, n_first, at, low, width, groups)
+
+
+def _of_layers(form: QuadraticForm, visible: Bits, hidden: Bits) -> tuple[QuadraticForm, Tensor]:
+    """Of an RBM without real units: still one matrix between two layers."""
+    weight, n = form.coupling, form.coupling.shape[-1]
+    b, c = form.bias[..., :n], form.bias[..., n:]
+    low_v, width_v, low_h, width_h = (x.to(weight) for x in (visible.low, visible.width, hidden.low, hidden.width))
+    of_v, of_h = b + low_h @ weight, c + weight @ low_v
+    coupling = weight * width_h.unsqueeze(-1) * width_v
+    bias = torch.cat((of_v * width_v, of_h * width_h), dim=-1)
+    return QuadraticForm(None, coupling, bias), -(of_v * low_v).sum(-1) - (c * low_h).sum(-1)
+
+
+def _of_pairs(
+    model: EnergyModel, form: QuadraticForm, at: Tensor, low: Tensor, width: Tensor
+) -> tuple[QuadraticForm, Tensor]:
+    """Of any model, by its matrix of couplings; only pairs that may be other than zero are kept."""
+    coupling, adjacent = _matrix(model, form)
+    bias = form.bias
+    kept = torch.zeros(model.n_units, dtype=torch.bool, device=at.device)
+    kept[at] = True
+    real = (~kept).nonzero().flatten()
+    constant = bias.new_zeros(model.replicas)
+    among = coupling[..., at[:, None], at]
+    linked = adjacent[at[:, None], at]
+    field = bias[..., at]
+    if len(real):
+        curvature = model.visible.curvature
+        assert curvature is not None
+        precision = curvature[..., real]
+        across, own = coupling[..., at[:, None], real], bias[..., real]
+        over = across / precision.unsqueeze(-2)
+        among = among + over @ across.mT
+        field = field + (over @ own.unsqueeze(-1)).squeeze(-1)
+        touches = adjacent[at[:, None], real].to(torch.float32)
+        linked = linked | (touches @ touches.mT > 0)
+        constant = -0.5 * (own.square() / precision + torch.log(2 * math.pi / precision)).sum(-1)
+    # E = constant - field.x - x'Ax / 2 with x = low + width y, and y^2 = y on the diagonal.
+    pull = (among @ low.unsqueeze(-1)).squeeze(-1)
+    offset = constant - (field * low).sum(-1) - 0.5 * (pull * low).sum(-1)
+    of_bits = width * (field + pull) + 0.5 * among.diagonal(dim1=-2, dim2=-1) * width.square()
+    pairs = linked.triu(diagonal=1).nonzero()
+    first, second = pairs[:, 0], pairs[:, 1]
+    return QuadraticForm(pairs, among[..., first, second] * width[first] * width[second], of_bits), offset
+
+
+def _matrix(model: EnergyModel, form: QuadraticForm) -> tuple[Float[Tensor, "*replicas n n"], Tensor]:
+    """Symmetric couplings of all entries, and which of them there are."""
+    n, n_visible = model.n_units, model.n_visible
+    matrix = form.coupling.new_zeros(*model.replicas, n, n)
+    adjacent = torch.zeros(n, n, dtype=torch.bool, device=matrix.device)
+    if form.pairs is None:
+        matrix[..., n_visible:, :n_visible] = form.coupling
+        adjacent[n_visible:, :n_visible] = True
+    else:
+        first, second = form.pairs.unbind(-1)
+        matrix[..., first, second] = form.coupling
+        adjacent[first, second] = True
+    return matrix + matrix.mT, adjacent | adjacent.mT
+
+
+@torch.no_grad()
+def read_bits(model: EnergyModel, form: BitForm, y: Float[Tensor, "*replicas n n_bits"]) -> Configurations:
+    """Configurations of a model at bits; real units stand at their means given the others."""
+    x = form.low.new_zeros(*y.shape[:-1], model.n_units)
+    x[..., form.at] = form.low + form.width * y.to(form.low)
+    if model.visible.real:
+        _set_real(model, x)
+    return Configurations(x[..., : model.n_visible], x[..., model.n_visible :])
+
+
+@torch.no_grad()
+def descend(model: EnergyModel, configurations: Configurations) -> Configurations:
+    """Set each class of units to its likeliest values given the others, in turn, until no energy falls.
+
+    No configuration ends with a higher energy; one with a site in no state or in several gets a state there first.
+    """
+    x = torch.cat(configurations[:2], dim=-1)
+    blocks, n = model.blocks(), model.n_visible
+    energy = torch.full(x.shape[:-1], torch.inf, dtype=x.dtype, device=x.device)
+    while True:
+        for block in blocks:
+            x[..., block.units] = block.kind.mode(block.field(x))
+        now = model.energy(x[..., :n], x[..., n:])
+        if not bool((now < energy - 1e-6 * energy.abs().nan_to_num(posinf=0.0)).any()):
+            break
+        energy = now
+    return configurations._replace(v=x[..., :n], h=x[..., n:])
+
+
+@torch.no_grad()
+def with_real_spread(model: EnergyModel, configurations: Configurations) -> Configurations:
+    """Configurations whose real visible units stand for their distribution given the others: two points each."""
+    if not model.visible.real:
+        return configurations
+    x, found = torch.cat(configurations[:2], dim=-1), []
+    n_points = len(model.visible.points(model.b.unsqueeze(-2)))
+    for number in range(n_points):
+        moved = x.clone()
+        _set_real(model, moved, number)
+        found.append(moved)
+    x, n = torch.cat(found, dim=-2), model.n_visible
+    weight = configurations.weight
+    return Configurations(x[..., :n], x[..., n:], None if weight is None else torch.cat([weight] * n_points, dim=-1))
+
+
+def _set_real(model: EnergyModel, x: Tensor, point: int | None = None) -> None:
+    """Set the real visible units to their modes given the others, or to one of their points, in place."""
+    for block in model.blocks():
+        curvature = block.kind.curvature
+        if curvature is not None:
+            field = block.field(x)
+            values = block.kind.mode(field) if point is None else block.kind.points(field)[point]
+            at = (curvature != 0).reshape(-1, curvature.shape[-1])[0]
+            x[..., block.units[at]] = values[..., at]

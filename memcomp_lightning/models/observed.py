@@ -1,0 +1,62 @@
+"""Data of which some values are missing: what is known of the hidden units then."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from memcomp_lightning.errors import require
+from memcomp_lightning.models.base import EnergyModel, Hidden, Visible
+
+Observed = Bool[Tensor, "*replicas n n_visible"]
+"""Where visible units are known; the entries of a categorical site are all known, or none of them."""
+
+
+def check_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
+    """Raise a SettingError for a mask of another shape, or one that hides a whole row, a whole column or half a site."""
+    require(observed.shape == v.shape, "shape of observed", tuple(observed.shape), f"{tuple(v.shape)}, that of v")
+    require(observed.dtype == torch.bool, "dtype of observed", str(observed.dtype), "torch.bool")
+    for axis, name in ((-1, "row"), (-2, "column")):
+        hidden = (~observed.any(axis)).nonzero()
+        place = hidden[0].tolist()[-1] if len(hidden) else 0
+        remedy = f"Leave out the {name}."
+        require(not len(hidden), f"observed values in {name} {place}", 0, "one or more", remedy)
+    known = model.visible.site_sums(observed.to(v.dtype))
+    sizes = model.visible.site_sums(torch.ones(model.n_visible, dtype=v.dtype, device=v.device))
+    half = ((known != 0) & (known != sizes)).nonzero()
+    site = half[0].tolist()[-1] if len(half) else 0
+    require(not len(half), f"observed entries of site {site}", "a part", "all entries of a site, or none")
+
+
+def visible_field(model: EnergyModel, h: Hidden) -> Visible:
+    """Fields of the visible units given the hidden ones.
+
+    Raises:
+        SettingError: Visible units are coupled to each other.
+    """
+    n = model.n_visible
+    x = torch.cat((h.new_zeros(*h.shape[:-1], n), h), dim=-1)
+    field = torch.empty_like(x)
+    for block in model.blocks():
+        seen = block.units < n
+        coupled = bool(seen.any()) and bool((block.neighbours < n).any())
+        remedy = "Use positive=clamped_gibbs, which draws what is missing."
+        require(not coupled, "couplings between visible units", True, "none where missing values are summed", remedy)
+        field[..., block.units] = block.field(x)
+    return field[..., :n]
+
+
+def log_weight_of_hidden(
+    model: EnergyModel, v: Visible, observed: Observed, h: Float[Tensor, "*replicas n_states n_hidden"]
+) -> Float[Tensor, "*replicas n n_states"]:
+    r"""Log of the sum over the missing values of ``exp(-E(v, h))``, for each row of data and each hidden state.
+
+    .. math:: \log w(h) = -E(0, h) + \sum_{observed} (f_j(h) v_j + \log \mu(v_j)) + \sum_{missing} A(f_j(h))
+
+    with the fields f of the visible units, none of which may be coupled to another.
+    """
+    units, field = model.visible, visible_field(model, h)
+    known = torch.where(observed, v, 0.0)
+    missing = (units.site_sums(observed.to(v.dtype)) == 0).to(v.dtype)
+    of_hidden = -model.energy(h.new_zeros(*h.shape[:-1], model.n_visible), h)
+    found = of_hidden.unsqueeze(-2) + known @ field.mT + missing @ units.cumulant(field).mT
+    return found if units.linear else found - units.energy(known).unsqueeze(-1)

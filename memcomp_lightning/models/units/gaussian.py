@@ -1,0 +1,140 @@
+"""Real units, normally distributed given their fields."""
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Generator, Tensor, nn
+
+from memcomp_lightning.errors import require
+from memcomp_lightning.models.units.base import Bits, PerSite, Units, Values, require_values
+
+SMALLEST_SHARE = 0.05
+"""A learned variance stays below 1 / 0.05 = 20 times that of the data, or of the first value."""
+
+LARGEST_SHARE = 1e4
+"""It stays above 1e-4 times that: a single row must not get all density."""
+
+
+class Gaussian(Units):
+    r"""Real units with normal conditionals, in natural parameters: field f and precision :math:`\gamma`.
+
+    .. math:: \mu(x) = e^{-\gamma x^2 / 2}, \quad x | f \sim N(f / \gamma, 1 / \gamma), \quad
+              A(f) = \frac{f^2}{2 \gamma} + \frac{1}{2} \log \frac{2 \pi}{\gamma}
+
+    The energy is linear in both, as in every other parameter of a model. Give columns of about unit variance: one
+    learning rate then fits all of them.
+
+    Args:
+        n: Number of units.
+        variance: :math:`1 / \gamma` to begin with, a number or ``(n,)``, > 0 and finite.
+        learned: Whether training changes it.
+
+    Attributes:
+        precision: :math:`\gamma`, ``(*replicas, n)``.
+
+    Raises:
+        SettingError: A variance that is not > 0 or not finite.
+    """
+
+    linear: ClassVar[bool] = False
+    real: ClassVar[bool] = True
+
+    def __init__(self, n: int, *, variance: float | Tensor = 1.0, learned: bool = True) -> None:
+        super().__init__(n)
+        given = torch.as_tensor(variance, dtype=torch.float32)
+        require(given.shape in ((), (n,)), "shape of variance", tuple(given.shape), f"() or ({n},)")
+        wrong = ~((given > 0) & given.isfinite()).expand(n)
+        if bool(wrong.any()):
+            column = int(wrong.nonzero()[0])
+            _refuse_variance(float(given.expand(n)[column]), column)
+        self.learned = learned
+        precision = (1 / given).expand(n).clone()
+        self.precision: Tensor
+        if learned:
+            self.precision = nn.Parameter(precision)
+        else:
+            self.register_buffer("precision", precision)
+        self.first_precision: Tensor
+        self.register_buffer("first_precision", precision.clone())
+
+    def mean(self, field: Values) -> Values:
+        """field / precision."""
+        return field / self.precision.unsqueeze(-2)
+
+    def sample(self, field: Values, *, generator: Generator) -> Values:
+        """Draw from N(field / precision, 1 / precision)."""
+        noise = torch.empty(field.shape, dtype=field.dtype, device=generator.device)
+        noise = noise.normal_(generator=generator).to(field.device)
+        return self.mean(field) + noise * self.precision.rsqrt().unsqueeze(-2)
+
+    def mode(self, field: Values) -> Values:
+        """The mean."""
+        return self.mean(field)
+
+    def cumulant(self, field: Values) -> PerSite:
+        """f^2 / (2 precision) + log(2 pi / precision) / 2."""
+        precision = self.precision.to(field.dtype).unsqueeze(-2)
+        return field.square() / (2 * precision) + 0.5 * torch.log(2 * math.pi / precision)
+
+    def points(self, field: Values) -> list[Values]:
+        """Mean plus and mean less a standard deviation: their first and second moments are the exact ones."""
+        mean, deviation = self.mean(field), self.precision.rsqrt().unsqueeze(-2)
+        return [mean + deviation, mean - deviation]
+
+    @property
+    def curvature(self) -> Tensor:
+        """The precision."""
+        return self.precision
+
+    def energy(self, x: Values) -> Tensor:
+        """Half of precision x^2, summed."""
+        return 0.5 * (x.square() * self.precision.unsqueeze(-2)).sum(-1)
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Keep a learned precision positive, and between shares of the first one."""
+        if self.learned:
+            first = self.first_precision
+            self.precision.clamp_(SMALLEST_SHARE * first, LARGEST_SHARE * first)
+
+    def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
+        """Values are finite."""
+        remedy = "Mark missing values by a mask."
+        require_values(v, v.isfinite(), observed, column, column, "finite values for Gaussian units", remedy)
+
+    def bias_of(self, total: Values, n: float | Tensor) -> Values:
+        """Mean times precision."""
+        return total / n * self.precision
+
+    @torch.no_grad()
+    def start(self, mean: Values, variance: Values) -> None:
+        """Take the precisions of the data, if they are learned.
+
+        Raises:
+            SettingError: A column that is constant.
+        """
+        if not self.learned:
+            return
+        usable = (variance > 0) & variance.isfinite()
+        if not bool(usable.all()):
+            place = (~usable).nonzero()[0].tolist()
+            _refuse_variance(float(variance[tuple(place)]), place[-1])
+        self.precision.copy_((1 / variance).expand_as(self.precision))
+        self.first_precision.copy_(self.precision)
+
+    def bits(self) -> Bits:
+        """None: the units are integrated out."""
+        return Bits(torch.arange(0), torch.zeros(0), torch.zeros(0))
+
+    def select(self, entries: Tensor) -> "Gaussian":
+        """Some of the units, with copies of their precisions."""
+        part = Gaussian(len(entries), learned=False)
+        part.precision = self.precision.detach()[..., entries]
+        part.first_precision = self.first_precision[..., entries]
+        return part
+
+
+def _refuse_variance(value: float, column: int) -> None:
+    allowed = "a finite number > 0 for Gaussian units"
+    require(False, f"variance of column {column}", value, allowed, "Leave out columns that are constant.")
