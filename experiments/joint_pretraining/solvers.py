@@ -15,8 +15,8 @@ from dwave.samplers import SimulatedAnnealingSampler
 from memcomp_lightning import rng
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.models import DBM, BoltzmannMachine, Gaussian
-from memcomp_lightning.problems import Qubo
-from memcomp_lightning.samplers.ground_state import problem_of
+from memcomp_lightning.problems import Qubo, from_model
+from memcomp_lightning.samplers.ground_state import posed_as
 from memcomp_lightning.solvers import Portfolio, QuboSolver
 from memcomp_lightning.solvers.dmm import DmmSolver
 
@@ -66,7 +66,7 @@ def main() -> None:
             with torch.no_grad():
                 for bias in (model.b, model.c):
                     bias.normal_(0.0, STD, generator=generator)
-            qubo, _ = problem_of(model)
+            qubo = from_model(posed_as(model)[0])
             runs = [found_by(solver, qubo, instance) for solver in (Portfolio(), DmmSolver())]
             runs.append(annealed(qubo, given.reads, given.sweeps, instance))
             if instance:  # the first one loads what is compiled

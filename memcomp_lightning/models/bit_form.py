@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from memcomp_lightning.models.base import EnergyModel, QuadraticForm
@@ -48,7 +48,9 @@ def bit_form(model: EnergyModel) -> BitForm:
     """
     visible, hidden = model.visible.bits(), model.hidden.bits()
     at = torch.cat((visible.at, hidden.at + model.n_visible)).to(model.b.device)
-    low, width = (torch.cat(pair).to(model.b) for pair in ((visible.low, hidden.low), (visible.width, hidden.width)))
+    low, width = (
+        torch.cat(pair).to(model.b) for pair in ((visible.low, hidden.low), (visible.width, hidden.width))
+    )
     n_first, shift = len(visible.at), len(visible.at)
     groups = [*visible.groups, *([bit + shift for bit in group] for group in hidden.groups)]
     zero = model.b.new_zeros(model.replicas)
@@ -122,7 +124,7 @@ def _matrix(model: EnergyModel, form: QuadraticForm) -> tuple[Float[Tensor, "*re
 
 
 @torch.no_grad()
-def read_bits(model: EnergyModel, form: BitForm, y: Float[Tensor, "*replicas n n_bits"]) -> Configurations:
+def read_bits(model: EnergyModel, form: BitForm, y: Shaped[Tensor, "*replicas n n_bits"]) -> Configurations:
     """Configurations of a model at bits; real units stand at their means given the others."""
     x = form.low.new_zeros(*y.shape[:-1], model.n_units)
     x[..., form.at] = form.low + form.width * y.to(form.low)
@@ -163,7 +165,9 @@ def with_real_spread(model: EnergyModel, configurations: Configurations) -> Conf
         found.append(moved)
     x, n = torch.cat(found, dim=-2), model.n_visible
     weight = configurations.weight
-    return Configurations(x[..., :n], x[..., n:], None if weight is None else torch.cat([weight] * n_points, dim=-1))
+    return Configurations(
+        x[..., :n], x[..., n:], None if weight is None else torch.cat([weight] * n_points, dim=-1)
+    )
 
 
 def _set_real(model: EnergyModel, x: Tensor, point: int | None = None) -> None:

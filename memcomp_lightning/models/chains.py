@@ -84,7 +84,9 @@ class ClassChains:
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw all units."""
-        return random_states(self._model, side_by_side(self._model.visible, self._model.hidden), n, generator=generator)
+        return random_states(
+            self._model, side_by_side(self._model.visible, self._model.hidden), n, generator=generator
+        )
 
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw each class given all others."""

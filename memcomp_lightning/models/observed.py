@@ -40,7 +40,9 @@ def visible_field(model: EnergyModel, h: Hidden) -> Visible:
         seen = block.units < n
         coupled = bool(seen.any()) and bool((block.neighbours < n).any())
         remedy = "Use positive=clamped_gibbs, which draws what is missing."
-        require(not coupled, "couplings between visible units", True, "none where missing values are summed", remedy)
+        require(
+            not coupled, "couplings between visible units", True, "none where missing values are summed", remedy
+        )
         field[..., block.units] = block.field(x)
     return field[..., :n]
 

@@ -164,7 +164,11 @@ class RBM(Machine):
     def outside_largest_class(self) -> tuple[Block, Tensor, Units]:
         """The larger layer, the units of the smaller one, and what these are."""
         visible, hidden = self.blocks()
-        return (visible, hidden.units, self.hidden) if self.enumerates_hidden else (hidden, visible.units, self.visible)
+        return (
+            (visible, hidden.units, self.hidden)
+            if self.enumerates_hidden
+            else (hidden, visible.units, self.visible)
+        )
 
     @torch.no_grad()
     def all_configurations(self) -> Configurations:

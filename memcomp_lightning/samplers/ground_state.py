@@ -70,7 +70,9 @@ class GroundState:
         qubo = from_bit_form(form)
         if form.groups:
             constrained = Constrained.of(qubo, [exactly(1, group) for group in form.groups])
-            solution = PenaltyLoop(solver=self.solver, n_turns=MOST_TURNS).minimise(constrained, generator=generator)
+            solution = PenaltyLoop(solver=self.solver, n_turns=MOST_TURNS).minimise(
+                constrained, generator=generator
+            )
         else:
             solution = self.solver.minimise(qubo, generator=generator)
         if self.readout == "best":

@@ -8,4 +8,15 @@ from memcomp_lightning.models.units.mixed import Mixed, side_by_side
 from memcomp_lightning.models.units.relu import ReLU
 from memcomp_lightning.models.units.spin import Spin
 
-__all__ = ["Bernoulli", "Bits", "Categorical", "Gaussian", "Mixed", "ReLU", "Spin", "Units", "all_states", "side_by_side"]
+__all__ = [
+    "Bernoulli",
+    "Bits",
+    "Categorical",
+    "Gaussian",
+    "Mixed",
+    "ReLU",
+    "Spin",
+    "Units",
+    "all_states",
+    "side_by_side",
+]

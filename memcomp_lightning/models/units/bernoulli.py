@@ -61,10 +61,12 @@ class Bernoulli(Units):
             require_values(v, (v == 0) | (v == 1), observed, column, "values in {0, 1}", remedy)
         else:
             remedy = "Scale the column, or give it real or categorical units."
-            require_values(v, (v >= 0) & (v <= 1), observed, column, "values in [0, 1] for Bernoulli units", remedy)
+            require_values(
+                v, (v >= 0) & (v <= 1), observed, column, "values in [0, 1] for Bernoulli units", remedy
+            )
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
-        """log (n_on + 1) / (n_off + 1)."""
+        """Log (n_on + 1) / (n_off + 1)."""
         return torch.log((total + 1) / (n - total + 1))
 
     def states(self, numbers: Tensor, *, like: Tensor) -> Tensor:

@@ -116,7 +116,7 @@ class Categorical(Units):
         return self._one_hot(self._table(field, -torch.inf).argmax(-1), field)
 
     def cumulant(self, field: Values) -> PerSite:
-        """log of the sum of exp(field) over the states of each site."""
+        """Log of the sum of exp(field) over the states of each site."""
         return torch.logsumexp(self._table(field, -torch.inf), dim=-1)
 
     def negative_entropy(self, mean: Values) -> Tensor:
@@ -127,9 +127,13 @@ class Categorical(Units):
     def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
         """Entries are in [0, 1] and add up to one in each site: between 0 and 1 they are probabilities."""
         if pure:
-            require_values(v, (v == 0) | (v == 1), observed, column, "entries in {0, 1} for categorical units", _ENCODE)
+            require_values(
+                v, (v == 0) | (v == 1), observed, column, "entries in {0, 1} for categorical units", _ENCODE
+            )
         else:
-            require_values(v, (v >= 0) & (v <= 1), observed, column, "entries in [0, 1] for categorical units", _ENCODE)
+            require_values(
+                v, (v >= 0) & (v <= 1), observed, column, "entries in [0, 1] for categorical units", _ENCODE
+            )
         sums = self.site_sums(v)
         seen = None if observed is None else self._table(observed, False).any(-1)
         wrong = (sums - 1).abs() > 1e-3 if seen is None else ((sums - 1).abs() > 1e-3) & seen
@@ -141,7 +145,7 @@ class Categorical(Units):
             require(False, name, float(sums[tuple(place)]), allowed, _ENCODE)
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
-        """log of the counts plus one, less its mean over the states of a site."""
+        """Log of the counts plus one, less its mean over the states of a site."""
         return self.zero_sum(torch.log(total + 1))
 
     def zero_sum(self, x: Values) -> Values:

@@ -59,7 +59,7 @@ class Gaussian(Units):
         self.register_buffer("first_precision", precision.clone())
 
     def mean(self, field: Values) -> Values:
-        """field / precision."""
+        """Field / precision."""
         return field / self.precision.unsqueeze(-2)
 
     def sample(self, field: Values, *, generator: Generator) -> Values:

@@ -30,7 +30,7 @@ class ReLU(Units):
     real: ClassVar[bool] = True
 
     def mean(self, field: Values) -> Values:
-        """f + phi(f) / Phi(f), without cancellation where f is far below zero."""
+        """F + phi(f) / Phi(f), without cancellation where f is far below zero."""
         far = field < -8.0
         inverse = torch.where(far, field, -8.0).reciprocal().square()
         tail = 1 - inverse * (2 - inverse * (10 - inverse * (74 - inverse * 706)))

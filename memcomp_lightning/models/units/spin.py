@@ -73,7 +73,7 @@ class Spin(Units):
         return 2**self.n
 
     def bits(self) -> Bits:
-        """s = 2 x - 1."""
+        """S = 2 x - 1."""
         return Bits(torch.arange(self.n), torch.full((self.n,), -1.0), torch.full((self.n,), 2.0))
 
     def beside(self, other: Units) -> "Spin | None":

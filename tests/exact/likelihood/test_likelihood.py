@@ -267,7 +267,9 @@ def test_grey_values_and_wrong_shapes_are_refused(call):
     rbm = small_rbm(replicas=(3,))
     v = images(rbm)
     v[1, 2, 3] = 0.25
-    message = re.escape("v in column 3, row 2 = 0.25 is not allowed: expected values in {0, 1}. Grey values have no likelihood")
+    message = re.escape(
+        "v in column 3, row 2 = 0.25 is not allowed: expected values in {0, 1}. Grey values have no likelihood"
+    )
     with pytest.raises(SettingError, match=f"^{message}.*binarise"):
         call(rbm, v)
     for shape in ((11, 5), (2, 11, 7), (3, 2, 11, 7)):

@@ -60,7 +60,7 @@ def test_the_coldest_chains_of_a_mutant_do_not(mutation):
 def test_exchanges_that_ignore_the_energies_are_seen(monkeypatch):
     """The test of the distribution rejects exchanges that are always made."""
     rbm = small_rbm(5, 3, std=1.0)
-    monkeypatch.setattr(RBM, "energy", lambda self, v, h: torch.zeros(v.shape[:-1]))
+    monkeypatch.setattr(RBM, "tempered_energy", lambda self, v, h: torch.zeros(v.shape[:-1]))
     assert p_values(rbm, rbm)[0] < LEVEL
 
 
