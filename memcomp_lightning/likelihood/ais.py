@@ -18,7 +18,7 @@ from memcomp_lightning.models.rbm import RBM
 Schedule = Sequence[float] | Tensor
 
 base_of = independent_bias
-"""Visible bias of the independent units that have the data's means, a base for AIS: ``base_of(v, model.visible)``."""
+"""Visible bias of independent units with the data's means, a base for AIS: ``base_of(v, model.visible)``."""
 
 
 class AisEstimate(NamedTuple):

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,6 +13,8 @@ from memcomp_lightning.models.base import Block, EnergyModel, Images, PerReplica
 from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
 from memcomp_lightning.models.units import Units, all_states
+
+ModelT = TypeVar("ModelT", bound=EnergyModel)
 
 
 def base_on_first_class(model: EnergyModel, base: Tensor) -> Tensor:
@@ -71,8 +74,9 @@ def log_likelihood_bound(
     .. math:: \log p(v) \ge -E(v, \mu) + \sum_i H(\mu_i) - \log Z
 
     with the means :math:`\mu` of :func:`memcomp_lightning.models.mean_field` and their entropies H
-    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled. The images are values of the
-    visible units and may be without replica axes. A log Z from AIS is too low on average, and the bound then too high.
+    (Salakhutdinov & Hinton 2009). Equal to log p(v) if no two hidden units are coupled. The images are values
+    of the visible units and may be without replica axes. A log Z from AIS is too low on average, and the bound
+    then too high.
     """
     require_count("max_iterations", max_iterations)
     model = double_of(model)
@@ -90,7 +94,7 @@ def _summed_over(model: EnergyModel, block: Block, x: Tensor) -> Tensor:
     return block.kind.cumulant(block.field(x)).sum(-1) - energy
 
 
-def double_of(model: EnergyModel) -> EnergyModel:
+def double_of(model: ModelT) -> ModelT:
     """The model in float64, a copy where it is not."""
     return model if model.b.dtype == torch.float64 else copy.deepcopy(model).double()
 

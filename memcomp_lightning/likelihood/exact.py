@@ -33,8 +33,8 @@ def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress:
 
     over the states s of the smaller layer, with bias g, and the units i of the other one. Time grows as
     2^n_smaller n_other, about 5e9 such pairs a second and CPU thread. A Boltzmann machine of two classes of units
-    is taken as such an RBM (``two_layers``), spins as bits; of any other machine, and of categorical and real units,
-    all units outside the largest class are enumerated, and that one is summed by its cumulants.
+    is taken as such an RBM (``two_layers``), spins as bits; of any other machine, and of categorical and real
+    units, all units outside the largest class are enumerated, and that one is summed by its cumulants.
 
     Args:
         model: The model, of any dtype.
@@ -117,18 +117,18 @@ def log_likelihood(
 ) -> PerState:
     """Return log p(v) = -F(v) - log Z of each image, in nats and float64.
 
-    With ``observed``, a mask of the shape of v, it is log p(observed values): the missing ones are summed, and up to
-    16 hidden units are enumerated.
+    With ``observed``, a mask of the shape of v, it is log p(observed values): the missing ones are summed, and up
+    to 16 hidden units are enumerated.
 
     In a Boltzmann machine whose hidden units are coupled to each other they are enumerated for each image, but for
     their largest class: up to 16 of them. For more, see :func:`log_likelihood_bound`.
 
-    Images are values of the visible units, ``(*replicas, n, n_visible)``, or without replica axes for the same images
-    everywhere. Of real units it is the log of a density. Log Z may be exact or estimated.
+    Images are values of the visible units, ``(*replicas, n, n_visible)``, or without replica axes for the same
+    images everywhere. Of real units it is the log of a density. Log Z may be exact or estimated.
 
     Raises:
-        SettingError: v has values that the units do not take, or the wrong shape; too many hidden units would have to
-            be enumerated.
+        SettingError: v has values that the units do not take, or the wrong shape; too many hidden units would have
+            to be enumerated.
     """
     v = pure_values(model, v, observed)
     if observed is not None:
@@ -172,7 +172,8 @@ def kl_divergence(model: EnergyModel, v: Images, log_z: PerReplica | None = None
     Images are those of :func:`log_likelihood`; without log Z, :func:`log_partition_function` enumerates.
 
     Raises:
-        SettingError: v has values that the units do not take, or the wrong shape; the smaller layer is too large to enumerate.
+        SettingError: v has values that the units do not take, or the wrong shape; the units are real; the smaller
+            layer is too large to enumerate.
     """
     require(not model.visible.real, "visible units", type(model.visible).__name__, "units that are not real")
     require_count("number of rows of v", pure_values(model, v).shape[-2])

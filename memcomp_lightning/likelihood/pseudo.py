@@ -33,9 +33,9 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
     .. math:: \log p(v_j | v_{-j}) = -F(v) - \log \sum_x \exp(-F(v \text{ with } v_j = x))
 
     (Besag 1975.) Of a real unit the sum is an integral, by the trapezoidal rule, and p a density. In an RBM the
-    hidden field for another value differs by columns of W; in a Boltzmann machine the hidden units, up to 16 outside
-    their largest class, are enumerated. The images are those of :func:`log_likelihood`; the log pseudo-likelihood
-    of one is the sum over the last axis.
+    hidden field for another value differs by columns of W; in a Boltzmann machine the hidden units, up to 16
+    outside their largest class, are enumerated. The images are those of :func:`log_likelihood`; the log
+    pseudo-likelihood of one is the sum over the last axis.
 
     Raises:
         SettingError: v has values that the units do not take, or the wrong shape; too many hidden units would have

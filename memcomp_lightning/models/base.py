@@ -119,8 +119,8 @@ class Chains(Protocol):
 class EnergyModel(Protocol):
     """What a model must offer to be trained and measured: units of some kind, their energies, means and chains.
 
-    The energy is linear in each unit but for the measures of real ones: where these are constant, it is, at means of
-    independent units, the expected one.
+    The energy is linear in each unit but for the measures of real ones. Where these are constant, it is the
+    expected one at means of independent units.
     """
 
     b: nn.Parameter
@@ -152,7 +152,7 @@ class EnergyModel(Protocol):
 
     @property
     def n_enumerated(self) -> float:
-        """Number of bits that exact computations enumerate: those of the states of all units outside the largest class."""
+        """Number of bits that exact computations enumerate: those of all units outside the largest class."""
 
     def double(self) -> Self:
         """The model itself, with its numbers in float64 from now on."""

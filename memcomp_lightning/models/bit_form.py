@@ -16,12 +16,12 @@ from memcomp_lightning.types import Configurations
 class BitForm(NamedTuple):
     r"""``E = offset + form`` over the bits y, with x = low + width y for the entries that have bits.
 
-    Real units are integrated out exactly: what is left is :math:`-\log \int e^{-E} dv` over theirs, a quadratic form
-    of the units that they are coupled to.
+    Real units are integrated out exactly: what is left is :math:`-\log \int e^{-E} dv` over them, a quadratic
+    form of the units that they are coupled to.
 
     Attributes:
-        form: Couplings and biases of the bits, those of visible entries first; ``pairs`` is None if each hidden bit
-            is coupled to each visible one and there are no other couplings.
+        form: Couplings and biases of the bits, those of visible entries first; ``pairs`` is None if each hidden
+            bit is coupled to each visible one and there are no other couplings.
         offset: ``(*replicas,)``.
         n_first: Bits of visible entries.
         at: Entry of x = (v, h) that each bit stands for, ``(n_bits,)``.

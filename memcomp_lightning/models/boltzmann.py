@@ -60,9 +60,9 @@ class BoltzmannMachine(Machine):
         n_visible: Number of visible units in {0, 1}, >= 1; None where ``visible`` says it.
         n_hidden: Number of hidden units in {0, 1}, >= 0; None where ``hidden`` says it, or else what the pairs of
             ``connectivity`` have beside the visible ones.
-        connectivity: Pairs of sites (for units of one entry, of units), or a symmetric mask ``(n_sites, n_sites)``;
-            None couples all. See
-            :mod:`memcomp_lightning.models.connectivity` for grids, layers and graphs of annealers.
+        connectivity: Pairs of sites (for units of one entry, of units), or a symmetric mask
+            ``(n_sites, n_sites)``; None couples all. See :mod:`memcomp_lightning.models.connectivity` for grids,
+            layers and graphs of annealers.
         visible: Kind of the visible units, see :mod:`memcomp_lightning.models.units`.
         hidden: Kind of the hidden units, not real.
         replicas: Leading axes of independent machines that share every call.
@@ -188,9 +188,9 @@ class BoltzmannMachine(Machine):
         """The classes, each with its couplings: what a sweep over all units needs."""
         bias, found = self.bias, []
         layouts = self._layouts()
-        kinds = self._kinds
-        if kinds is None:
-            kinds = [_kind_of(self.visible, self.hidden, layout.units) for layout in layouts]
+        kinds: Iterable[Any] = self._kinds or [
+            _kind_of(self.visible, self.hidden, layout.units) for layout in layouts
+        ]
         for (units, neighbours, edge, slot, _), kind in zip(layouts, kinds, strict=True):
             weight = self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
             found.append(Block(units, neighbours, weight, bias[..., units], kind))
@@ -226,7 +226,7 @@ class BoltzmannMachine(Machine):
         states = all_states(kind, self.b)
         x = states.new_zeros(*self.replicas, len(states), self.n_units)
         x[..., others] = states
-        # Summed over the largest class: exp(-E) with that class at zero, times exp(A(field)) for each of its sites.
+        # Summed over the largest class: exp(-E) with that class at zero, times exp(A(field)) a site.
         field, n = largest.field(x), self.n_visible
         log_weight = largest.kind.cumulant(field.double()).sum(-1) - self.energy(x[..., :n], x[..., n:]).double()
         weight, found = torch.softmax(log_weight, dim=-1).to(x.dtype), []

@@ -111,8 +111,8 @@ class ClassChains:
         self, positive: Configurations, k: int, *, visible: Readout, hidden: Readout, generator: Generator
     ) -> Configurations:
         """Sweep all units from the data, with hidden units drawn by their means; read as by ``read``."""
-        hidden = self._model.hidden.sample_of_mean(positive.h, generator=generator)
-        x = torch.cat((positive.v, positive.h if hidden is None else hidden), dim=-1)
+        drawn = self._model.hidden.sample_of_mean(positive.h, generator=generator)
+        x = torch.cat((positive.v, positive.h if drawn is None else drawn), dim=-1)
         for _ in range(k):
             x = self.sweep(x, generator=generator)
         return self.read(x)._replace(weight=positive.weight)

@@ -103,8 +103,8 @@ def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None
         observed: A mask of the values that count; None is all of them.
 
     Raises:
-        SettingError: A value that the units do not take; a column of real units that is constant; a mask that hides
-            a whole row or column.
+        SettingError: A value that the units do not take; a column of real units that is constant; a mask that
+            hides a whole row or column.
     """
     visible = model.visible
     visible.check(v, observed)

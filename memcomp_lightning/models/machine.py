@@ -106,7 +106,8 @@ class Machine(nn.Module):
         r"""The value of :meth:`total_energy` for weights that add up to 0, with the gradient of centred units.
 
         (Montavon & Mueller 2012.) Real units are centred in their squares too: with the energy
-        :math:`\gamma (v - \mu)^2 / 2 - b' (v - \mu)` a step of :math:`\gamma` moves :math:`b = b' + \gamma \mu` with it.
+        :math:`\gamma (v - \mu)^2 / 2 - b' (v - \mu)` a step of :math:`\gamma` moves
+        :math:`b = b' + \gamma \mu` with it.
         """
         with torch.no_grad():
             value = self.total_energy(v, h, weight)

@@ -37,7 +37,7 @@ def mean_field(
     max_iterations: int = 30,
     tolerance: float = 1e-3,
 ) -> MeanFieldSolution:
-    r"""Approximate the means of the free units: iterate ``m = mean(field)``, class by class, from units without fields.
+    r"""Approximate the means of the free units: iterate ``m = mean(field)``, class by class, from zero fields.
 
     Each update of a class minimises the Kullback-Leibler divergence of the factorised distribution from
     p(free | clamped) in its means, so that it falls with every iteration (Peterson & Anderson 1987). One iteration

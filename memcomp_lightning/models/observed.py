@@ -12,7 +12,7 @@ Observed = Bool[Tensor, "*replicas n n_visible"]
 
 
 def check_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
-    """Raise a SettingError for a mask of another shape, or one that hides a whole row, a whole column or half a site."""
+    """Raise a SettingError for a mask of another shape, or one that hides a row, a column or half a site."""
     require(observed.shape == v.shape, "shape of observed", tuple(observed.shape), f"{tuple(v.shape)}, that of v")
     require(observed.dtype == torch.bool, "dtype of observed", str(observed.dtype), "torch.bool")
     for axis, name in ((-1, "row"), (-2, "column")):

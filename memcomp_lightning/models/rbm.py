@@ -22,8 +22,8 @@ class RBM(Machine):
     .. math:: E(v, h) = -\sum_{ij} w_{ij} h_i v_j - \sum_j b_j v_j - \sum_i c_i h_i - \log \mu(v) - \log \mu(h)
 
     (Manukian et al. 2019, eq. 3.) The kinds of units say what v and h may be and give the measures
-    :math:`\mu`, which are 1 for units in {0, 1}, spins and categories. Where they are 1, values in between stand for
-    the means of independent units: the energy is then the expected one, because E is linear in each unit.
+    :math:`\mu`, which are 1 for units in {0, 1}, spins and categories. Where they are 1, values in between stand
+    for the means of independent units: the energy is then the expected one, because E is linear in each unit.
 
     Attributes:
         weight: ``(*replicas, n_hidden, n_visible)``; of categorical units there is a column for each state.
@@ -98,7 +98,7 @@ class RBM(Machine):
         return -(coupled + biases)
 
     def free_energy(self, v: Visible) -> PerState:
-        r"""F(v) = -b.v - log mu(v) - \sum_i A(W v + c)_i, so that p(v) = exp(-F(v)) / Z; A is the units' cumulant."""
+        r"""F(v) = -b.v - log mu(v) - \sum_i A(W v + c)_i with the cumulant A, so that p(v) = exp(-F(v)) / Z."""
         free = -self.hidden.cumulant(self.hidden_field(v)).sum(-1) - (v * self.b.unsqueeze(-2)).sum(-1)
         return free if self.visible.linear else free + self.visible.energy(v)
 
@@ -151,7 +151,7 @@ class RBM(Machine):
 
     @property
     def enumerates_hidden(self) -> bool:
-        """Whether exact computations enumerate the hidden layer: the one of fewer states, of those that have a list."""
+        """Whether exact computations enumerate the hidden layer: it has fewer states, or the other is real."""
         if self.visible.real or self.hidden.real:
             return self.visible.real
         return self.hidden.n_states < self.visible.n_states

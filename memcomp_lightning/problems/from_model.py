@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 def from_model(model: "EnergyModel") -> Qubo:
     """Return a model's energy as a QUBO, one problem a replica.
 
-    Of units in {0, 1} the energy at x = (v, h) is E(v, h). Spins are written in bits, the states of a category are a bit
-    each, of which exactly one has to be 1 (:func:`constrained_from_model` says so), and real units are integrated
-    out: ``models.bit_form`` has the details, and ``models.read_bits`` reads answers.
+    Of units in {0, 1} the energy at x = (v, h) is E(v, h). Spins are written in bits, the states of a category are
+    a bit each, of which exactly one has to be 1 (:func:`constrained_from_model` says so), and real units are
+    integrated out: ``models.bit_form`` has the details, and ``models.read_bits`` reads answers.
 
     Raises:
         SettingError: The model has units without a form in bits.

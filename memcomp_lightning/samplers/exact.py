@@ -16,13 +16,13 @@ class Exact:
     """The exact negative phase, for models that are small enough to be enumerated.
 
     It takes every state of the smaller layer with its probability, and the conditional means of the other layer.
-    Their mean energy is the exact expectation, because E is linear in each layer; of real units there are two points
-    with the right means and variances. In a model of any connectivity the class with most units takes its means;
-    the states of all others are enumerated.
+    Their mean energy is the exact expectation, because E is linear in each layer; of real units there are two
+    points with the right means and variances. In a model of any connectivity the class with most units takes its
+    means; the states of all others are enumerated.
 
     Attributes:
-        max_units: Units in {0, 1} that are enumerated at most, 1 to 20; 2^max_units configurations are held at once.
-            A site of q states counts as log2 q of them.
+        max_units: Units in {0, 1} that are enumerated at most, 1 to 20; 2^max_units configurations are held at
+            once. A site of q states counts as log2 q of them.
     """
 
     uses_data: ClassVar[bool] = False

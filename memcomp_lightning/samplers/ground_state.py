@@ -16,7 +16,7 @@ from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 MOST_TURNS = 2
-"""Turns of penalties for categorical units: what still breaks a constraint is mended, and an update cannot wait."""
+"""Turns of penalties for categorical units: what breaks a constraint is mended, and an update cannot wait."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -24,8 +24,8 @@ class GroundState:
     """Takes the state of lowest energy as the negative phase (Manukian et al. 2019, section 3.2).
 
     Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model. Of
-    categorical units it gets a bit a state with a hard constraint a site, and the answer descends to where no layer
-    alone can improve it. Real units are integrated out.
+    categorical units it gets a bit a state with a hard constraint a site, and the answer descends to where no
+    layer alone can improve it. Real units are integrated out.
 
     Attributes:
         solver: Finds low energies of the QUBO.
@@ -53,7 +53,8 @@ class GroundState:
         """Nothing to remember: every update solves a new problem.
 
         Raises:
-            SettingError: The model has units without a form in bits, or sites whose constraints a trajectory breaks.
+            SettingError: The model has units without a form in bits, or sites whose constraints a trajectory
+                breaks.
         """
         form = model.in_bits()
         allowed = "'best' for categorical units: states on the way to an answer break their constraints"
@@ -64,7 +65,7 @@ class GroundState:
     def sample(
         self, model: EnergyModel, state: NoState, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[NoState]:
-        """Return x* or the weighted trajectory; real units stand at two points around their means given the others."""
+        """Return x* or the weighted trajectory; real units stand at two points around their means."""
         posed, order = posed_as(model)
         form = posed.in_bits()
         qubo = from_bit_form(form)

@@ -65,9 +65,9 @@ class ModeAssisted:
 
     .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
 
-    with the mean energy of all joint states :math:`\bar E`, that of units without fields: E(1/2, 1/2) for units in
-    {0, 1}. It is the depth of the ground state as a share of the largest for couplings of size one. In a model of any
-    connectivity the number of couplings and biases, plus one, stands for
+    with the mean energy of all joint states :math:`\bar E`, that of units without fields: E(1/2, 1/2) for units
+    in {0, 1}. It is the depth of the ground state as a share of the largest for couplings of size one. In a
+    model of any connectivity the number of couplings and biases, plus one, stands for
     :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM; a categorical unit counts once. The scaled
     update is written as a negative phase: x* has the weight g, the positive phase keeps 1 - g. One coin serves all
     replicas, so that a ground state is computed only when it is used. The coin is tossed and counted once a call:

@@ -92,7 +92,7 @@ class Units(nn.Module):
         return None
 
     def points(self, field: Values) -> list[Values]:
-        """Values of equal weight whose mean energy is the expected one: the mean, where the measure is constant."""
+        """Values of equal weight whose mean energy is the expected one: the mean, if the measure is constant."""
         return [self.mean(field)]
 
     def negative_entropy(self, mean: Values) -> Float[Tensor, "*axes"]:

@@ -76,7 +76,7 @@ class Bernoulli(Units):
     @property
     def n_states(self) -> int:
         """2^n."""
-        return 2**self.n
+        return 1 << self.n
 
     def bits(self) -> Bits:
         """A bit a unit."""

@@ -73,7 +73,8 @@ class Categorical(Units):
         if self._q is not None:
             return x.unflatten(-1, (self.n_sites, self._q)) if self.n else x.new_zeros(*x.shape[:-1], 0, 1)
         flat = x.new_full((*x.shape[:-1], self.n_sites * self._widest), empty)
-        return flat.index_copy(-1, self._slot, x).unflatten(-1, (self.n_sites, self._widest))
+        table: Tensor = flat.index_copy(-1, self._slot, x).unflatten(-1, (self.n_sites, self._widest))
+        return table
 
     def _flat(self, table: Tensor) -> Tensor:
         """``(..., n_sites, widest)`` as ``(..., n)``."""

@@ -101,7 +101,7 @@ class Gaussian(Units):
     def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
         """Values are finite."""
         remedy = "Mark missing values by a mask."
-        require_values(v, v.isfinite(), observed, column, column, "finite values for Gaussian units", remedy)
+        require_values(v, v.isfinite(), observed, column, "finite values for Gaussian units", remedy)
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Mean times precision."""

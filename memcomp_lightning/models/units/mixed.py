@@ -1,7 +1,7 @@
 """Units of several kinds side by side, as the columns of a table."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Generator, Tensor, nn
@@ -56,7 +56,8 @@ class Mixed(Units):
         return torch.cat([function(k, part) for k, part in zip(self.kinds, self._split(x), strict=True)], dim=-1)
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
-        return x.split(self._sizes, dim=-1)
+        parts: tuple[Tensor, ...] = x.split(self._sizes, dim=-1)
+        return parts
 
     def mean(self, field: Values) -> Values:
         """Of each part."""
@@ -82,7 +83,7 @@ class Mixed(Units):
         return self._each(lambda kind, part: kind.cumulant(part), field)
 
     def points(self, field: Values) -> list[Values]:
-        """Those of the parts, side by side: their means may be taken separately, as no energy couples two parts."""
+        """Those of the parts, side by side, as no energy couples two parts."""
         found = [kind.points(part) for kind, part in zip(self.kinds, self._split(field), strict=True)]
         n = math.lcm(*map(len, found))
         return [torch.cat([points[k % len(points)] for points in found], dim=-1) for k in range(n)]
@@ -129,7 +130,7 @@ class Mixed(Units):
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Of each part."""
-        counts = self._split(n) if isinstance(n, Tensor) else [n] * len(self.kinds)
+        counts: Sequence[float | Tensor] = self._split(n) if isinstance(n, Tensor) else [n] * len(self.kinds)
         parts = zip(self.kinds, self._split(total), counts, strict=True)
         return torch.cat([kind.bias_of(part, count) for kind, part, count in parts], dim=-1)
 

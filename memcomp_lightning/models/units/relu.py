@@ -66,7 +66,7 @@ class ReLU(Units):
 
     def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
         """Values are finite and >= 0."""
-        require_values(v, (v >= 0) & v.isfinite(), observed, column, column, "finite values >= 0 for ReLU units")
+        require_values(v, (v >= 0) & v.isfinite(), observed, column, "finite values >= 0 for ReLU units")
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """The mean, which is the field where it is above one."""

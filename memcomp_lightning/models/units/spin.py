@@ -70,7 +70,7 @@ class Spin(Units):
     @property
     def n_states(self) -> int:
         """2^n."""
-        return 2**self.n
+        return 1 << self.n
 
     def bits(self) -> Bits:
         """S = 2 x - 1."""

@@ -28,6 +28,6 @@ class PositivePhaseSampler(Protocol):
     ) -> PositivePhase:
         """Return configurations for data ``(*replicas, n, n_visible)``, those of one row side by side.
 
-        Where ``observed``, a mask of this shape, is False, the value is missing: whatever stands there is not read,
-        and the configurations have values of these units that stand for p(missing, h | observed).
+        Where ``observed``, a mask of this shape, is False, the value is missing: whatever stands there is not
+        read, and the configurations have values of these units that stand for p(missing, h | observed).
         """

@@ -31,12 +31,12 @@ class Phase:
         name: What it is called in tables: "layer 1".
         tag: What follows the name of the stage in the tags of TensorBoard: "layer1"; nothing if empty.
         model: The model in training.
-        positive: Maps visible states ``(*replicas, n, n_visible)``, a mask of those that are observed (None is all)
-            and a random stream to the positive phase.
+        positive: Maps visible states ``(*replicas, n, n_visible)``, a mask of those that are observed (None is
+            all) and a random stream to the positive phase.
         visible_of: Maps images to visible states.
         images_of: Maps visible states to images, for pictures.
-        complete: Draws what is missing of images, ``(v, observed, generator)``, before ``visible_of``; None where the
-            positive phase knows the mask.
+        complete: Draws what is missing of images, ``(v, observed, generator)``, before ``visible_of``; None where
+            the positive phase knows the mask.
     """
 
     name: str
