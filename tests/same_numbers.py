@@ -43,12 +43,12 @@ SAMPLERS = (
     "quench",
     "dmm_qubo",
     "dmm_time_average",
-    "mode_assisted_pcd",
     "annealer",
 )
 
 COMMANDS = {
     **{name: ["train", f"sampler={name}", *SMALL] for name in SAMPLERS},
+    "mode_assisted_pcd": ["train", "sampler=mode_assisted_pcd", "solver=dmm", *SMALL],
     "exact": ["train", "sampler=exact", *EXACT, *SMALL],
     "paper": ["train", "preset=paper", *SMALL],
     "centred_momentum": ["train", "sampler=pcd", "pretrain=centred", "preset=paper", *SMALL],
