@@ -6,6 +6,7 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.models import chains
+from memcomp_lightning.models.units import Bernoulli
 from memcomp_lightning.testing.conformance import small_rbm
 
 
@@ -19,11 +20,11 @@ def transition_matrix(monkeypatch):
         for h in binary_states(rbm.n_hidden, like=rbm.b):
             outcomes, probabilities = [h.expand(len(v), -1), v], []
 
-            def scripted(probability, *, generator, outcomes=outcomes, probabilities=probabilities):
-                probabilities.append(probability)
+            def scripted(self, field, *, generator, outcomes=outcomes, probabilities=probabilities):
+                probabilities.append(torch.sigmoid(field))
                 return outcomes[len(probabilities) - 1]
 
-            monkeypatch.setattr(rng, "bernoulli", scripted)
+            monkeypatch.setattr(Bernoulli, "sample", scripted)
             chains.sweep(rbm, v, beta=beta, generator=rng.stream(0, "unused"))
             p_hidden, p_visible = probabilities
             to_h = (p_hidden * h + (1 - p_hidden) * (1 - h)).prod(-1)
