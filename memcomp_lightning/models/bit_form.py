@@ -57,7 +57,7 @@ def bit_form(model: EnergyModel) -> BitForm:
     if type(model.visible) is Bernoulli and type(model.hidden) is Bernoulli:
         return BitForm(model.quadratic_form(), zero, n_first, at, low, width, groups)
     form = model.quadratic_form()
-    if form.pairs is None and not model.visible.real:
+    if form.pairs is None and not _has_real(model):
         changed, offset = _of_layers(form, visible, hidden)
     else:
         changed, offset = _of_pairs(model, form, at, low, width)
@@ -89,9 +89,7 @@ def _of_pairs(
     linked = adjacent[at[:, None], at]
     field = bias[..., at]
     if len(real):
-        curvature = model.visible.curvature
-        assert curvature is not None
-        precision = curvature[..., real]
+        precision = _curvature(model)[..., real]
         across, own = coupling[..., at[:, None], real], bias[..., real]
         over = across / precision.unsqueeze(-2)
         among = among + over @ across.mT
@@ -128,9 +126,17 @@ def read_bits(model: EnergyModel, form: BitForm, y: Shaped[Tensor, "*replicas n 
     """Configurations of a model at bits; real units stand at their means given the others."""
     x = form.low.new_zeros(*y.shape[:-1], model.n_units)
     x[..., form.at] = form.low + form.width * y.to(form.low)
-    if model.visible.real:
-        _set_real(model, x)
-    return Configurations(x[..., : model.n_visible], x[..., model.n_visible :])
+    return at_real_means(model, Configurations(x[..., : model.n_visible], x[..., model.n_visible :]))
+
+
+@torch.no_grad()
+def at_real_means(model: EnergyModel, configurations: Configurations) -> Configurations:
+    """Configurations with real units at their means given the others."""
+    if not _has_real(model):
+        return configurations
+    x, n = torch.cat(configurations[:2], dim=-1), model.n_visible
+    _set_real(model, x)
+    return configurations._replace(v=x[..., :n], h=x[..., n:])
 
 
 @torch.no_grad()
@@ -154,28 +160,53 @@ def descend(model: EnergyModel, configurations: Configurations) -> Configuration
 
 @torch.no_grad()
 def with_real_spread(model: EnergyModel, configurations: Configurations) -> Configurations:
-    """Configurations whose real visible units stand for their distribution given the others: two points each."""
-    if not model.visible.real:
+    """Configurations whose real units stand for their distribution given the others: two points each.
+
+    The first points of all configurations come first, then the second ones.
+    """
+    if not _has_real(model):
         return configurations
-    x, found = torch.cat(configurations[:2], dim=-1), []
-    n_points = len(model.visible.points(model.b.unsqueeze(-2)))
+    x, found, n = torch.cat(configurations[:2], dim=-1), [], model.n_visible
+    n_points = _n_points(model, x)
     for number in range(n_points):
         moved = x.clone()
         _set_real(model, moved, number)
         found.append(moved)
-    x, n = torch.cat(found, dim=-2), model.n_visible
-    weight = configurations.weight
+    x, weight = torch.cat(found, dim=-2), configurations.weight
     return Configurations(
         x[..., :n], x[..., n:], None if weight is None else torch.cat([weight] * n_points, dim=-1)
     )
 
 
+def _has_real(model: EnergyModel) -> bool:
+    return model.visible.real or model.hidden.real
+
+
+def _curvature(model: EnergyModel) -> Float[Tensor, "*replicas n"]:
+    """Precision of each unit, zero for those that are not real."""
+    layers = (model.visible, model.n_visible), (model.hidden, model.n_hidden)
+    return torch.cat(
+        [
+            model.b.new_zeros(*model.replicas, n) if (own := units.curvature) is None else own
+            for units, n in layers
+        ],
+        dim=-1,
+    )
+
+
+def _n_points(model: EnergyModel, x: Tensor) -> int:
+    """Points that real units have at one state of the others."""
+    real = [block for block in model.blocks() if block.kind.curvature is not None]
+    return math.lcm(*(len(block.kind.points(block.field(x[..., :1, :]))) for block in real))
+
+
 def _set_real(model: EnergyModel, x: Tensor, point: int | None = None) -> None:
-    """Set the real visible units to their modes given the others, or to one of their points, in place."""
+    """Set the real units to their modes given the others, or to one of their points, in place."""
     for block in model.blocks():
         curvature = block.kind.curvature
         if curvature is not None:
             field = block.field(x)
-            values = block.kind.mode(field) if point is None else block.kind.points(field)[point]
+            points = [block.kind.mode(field)] if point is None else block.kind.points(field)
+            values = points[(point or 0) % len(points)]
             at = (curvature != 0).reshape(-1, curvature.shape[-1])[0]
             x[..., block.units[at]] = values[..., at]

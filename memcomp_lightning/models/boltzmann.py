@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
@@ -352,7 +352,7 @@ def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Lay
     return found
 
 
-def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Pairs:
+def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor, "n_of_entries 2"]:
     """Pairs of entries, all of one site with all of the other, in ascending order."""
     if len(site_of) == n_sites:
         return site_pairs

@@ -65,9 +65,10 @@ class AnnealerSamples:
         Raises:
             SettingError: Categorical or real units, which an annealer does not sample.
         """
-        two_valued = not model.visible.real and not model.in_bits().groups
         allowed = "units of two values, {0, 1} or spins, for an annealer"
-        require(two_valued, "visible units", type(model.visible).__name__, allowed)
+        for name, units in (("visible", model.visible), ("hidden", model.hidden)):
+            two_valued = not units.real and not units.bits().groups
+            require(two_valued, f"{name} units", type(units).__name__, allowed)
         beta = 1.0 if self.beta == "estimate" else float(self.beta)
         return AnnealerState(torch.full(model.replicas, beta, dtype=model.b.dtype, device=model.b.device))
 

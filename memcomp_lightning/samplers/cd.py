@@ -41,11 +41,16 @@ class CD:
         """Nothing to remember: every call starts at the data.
 
         Raises:
-            SettingError: Other readouts than the default ones for a model that is not drawn layer by layer.
+            SettingError: Other readouts than the default ones for a model that is not drawn layer by layer; means
+                of visible units whose variance is learned.
         """
         for name, default in (("visible", "sample"), ("hidden", "mean")):
             readout, allowed = getattr(self, name), f"{default!r} for a model other than an RBM"
             require(readout == default or model.chains().free_readout, name, readout, allowed)
+        # Squares of means lack the variance: a learned precision would follow a wrong gradient.
+        learned = any(parameter.requires_grad for parameter in model.visible.parameters())
+        allowed = "'sample' for real units whose precision is learned"
+        require(self.visible == "sample" or not learned, "visible", self.visible, allowed)
         return NoState()
 
     @torch.no_grad()

@@ -10,6 +10,7 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.bit_form import at_real_means
 from memcomp_lightning.objective import shares
 from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -128,10 +129,13 @@ class ModeAssisted:
 
 
 def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
-    """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1]; the lowest energy counts."""
+    """The factor g of an update with the mode, ``(*replicas,)`` in [0, 1].
+
+    The lowest energy counts, that of real units at their means given the others.
+    """
     layers = (model.visible, mode.v), (model.hidden, mode.h)
     free_v, free_h = (units.mean(torch.zeros_like(x[..., :1, :])) for units, x in layers)
-    energy = model.tempered_energy(mode.v, mode.h).amin(-1)
+    energy = model.tempered_energy(*at_real_means(model, mode)[:2]).amin(-1)
     depth = model.tempered_energy(free_v, free_h).squeeze(-1) - energy
     scale: Tensor = depth / (4 * _n_terms(model))
     return scale.clamp(0.0, 1.0)

@@ -8,8 +8,10 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, EnergyModel, Gaussian
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, EnergyModel, Gaussian, units
 from memcomp_lightning.models.connectivity import full
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.samplers import positive_phase, tensors_of
@@ -22,27 +24,93 @@ ModelT = TypeVar("ModelT", RBM, DBM, BoltzmannMachine)
 
 
 def small_rbm(
-    n_visible: int = 7, n_hidden: int = 5, replicas: tuple[int, ...] = (), std: float = 0.8, seed: int = 0
+    n_visible: int = 7,
+    n_hidden: int = 5,
+    replicas: tuple[int, ...] = (),
+    std: float = 0.8,
+    seed: int = 0,
+    *,
+    visible: Units | None = None,
+    hidden: Units | None = None,
 ) -> RBM:
-    """A rectangular RBM with non-zero biases, so that a transpose or a sign shows."""
+    """A rectangular RBM with non-zero biases, so that a transpose or a sign shows; of any units."""
+    visible, hidden = visible or units.Bernoulli(n_visible), hidden or units.Bernoulli(n_hidden)
     generator = rng.stream(seed, "test model")
-    rbm = RBM(n_visible, n_hidden, replicas=replicas, weight_init=Gaussian(std=std), generator=generator)
+    init = Gaussian(std=std)
+    rbm = RBM(visible=visible, hidden=hidden, replicas=replicas, weight_init=init, generator=generator)
     return _with_biases(rbm, generator)
 
 
-def small_dbm(*, replicas: tuple[int, ...] = ()) -> DBM:
-    """A DBM of 5, 3 and 2 units, biases drawn as those of :func:`small_rbm`."""
+def small_dbm(*, replicas: tuple[int, ...] = (), visible: Units | None = None) -> DBM:
+    """A DBM of 5, 3 and 2 units, or of other visible ones, biases drawn as those of :func:`small_rbm`."""
     generator = rng.stream(0, "test model")
-    dbm = DBM(5, [3, 2], replicas=replicas, weight_init=Gaussian(std=0.8), generator=generator)
+    visible = visible or units.Bernoulli(5)
+    dbm = DBM(
+        hidden_sizes=[3, 2],
+        visible=visible,
+        replicas=replicas,
+        weight_init=Gaussian(std=0.8),
+        generator=generator,
+    )
     return _with_biases(dbm, generator)
 
 
-def small_machine(*, replicas: tuple[int, ...] = ()) -> BoltzmannMachine:
-    """A Boltzmann machine of 4 visible and 3 hidden units, all but one pair coupled, with biases."""
+def small_machine(
+    *, replicas: tuple[int, ...] = (), visible: Units | None = None, hidden: Units | None = None
+) -> BoltzmannMachine:
+    """A Boltzmann machine of 4 visible and 3 hidden units or of others, with biases.
+
+    All but one pair of sites are coupled, and no two real units.
+    """
     generator = rng.stream(0, "test model")
-    pairs, init = full(7)[1:], Gaussian(std=0.5)
-    machine = BoltzmannMachine(4, 3, pairs, replicas=replicas, weight_init=init, generator=generator)
+    visible, hidden = visible or units.Bernoulli(4), hidden or units.Bernoulli(3)
+    pairs, init = full(visible.n_sites + hidden.n_sites)[1:], Gaussian(std=0.5)
+    real = _real_sites(visible)
+    pairs = pairs[~torch.isin(pairs, real).all(-1)]
+    machine = BoltzmannMachine(
+        visible=visible,
+        hidden=hidden,
+        connectivity=pairs,
+        replicas=replicas,
+        weight_init=init,
+        generator=generator,
+    )
     return _with_biases(machine, generator)
+
+
+def _real_sites(layer: Units) -> Tensor:
+    """Numbers of the sites of a layer that are real."""
+    found, n = [], 0
+    for kind in layer.kinds if isinstance(layer, units.Mixed) else [layer]:
+        found += list(range(n, n + kind.n_sites)) if kind.real else []
+        n += kind.n_sites
+    return torch.tensor(found, dtype=torch.long)
+
+
+def visible_kinds() -> dict[str, Units]:
+    """Small layers of visible units of every kind."""
+    variance = torch.tensor([0.5, 1.0, 2.0, 1.5])
+    return {
+        "bits": units.Bernoulli(4),
+        "spins": units.Spin(4),
+        "categories": units.Categorical(3, q=3),
+        "categories of several sizes": units.Categorical([2, 4, 3]),
+        "real": units.Gaussian(4, variance=variance),
+        "real of fixed precision": units.Gaussian(4, variance=variance, learned=False),
+        "mixed": units.Mixed(
+            units.Spin(1), units.Categorical([3, 2]), units.Gaussian(2, variance=variance[:2]), units.Bernoulli(1)
+        ),
+    }
+
+
+def hidden_kinds() -> dict[str, Units]:
+    """Small layers of hidden units of every kind."""
+    return {
+        "bits": units.Bernoulli(3),
+        "spins": units.Spin(3),
+        "categories": units.Categorical([3, 2]),
+        "rectified": units.ReLU(3),
+    }
 
 
 def _with_biases(model: ModelT, generator: Generator) -> ModelT:
@@ -57,15 +125,15 @@ def check_sampler(
 ) -> None:
     """Run a sampler on small models with and without replica axes and check the contract.
 
-    Checked: shapes, values in [0, 1], finite non-negative weights, a gradient for every parameter that does
-    not flow into the sampler, model and state left alone, no draw from the global random stream, the same
-    answer from the same stream, and that settings are frozen.
+    Checked: shapes, values that the model's units allow, finite non-negative weights, a gradient for every
+    parameter that does not flow into the sampler, model and state left alone, no draw from the global random
+    stream, the same answer from the same stream, and that settings are frozen.
 
     Args:
         sampler: The sampler.
-        n_data: Images.
-        make: Takes ``replicas`` and returns the model: :func:`small_rbm`, or for samplers of any connectivity
-            :func:`small_dbm` and :func:`small_machine` as well.
+        n_data: Rows of data, which are means under random fields.
+        make: Takes ``replicas`` and returns the model, of any kind of units: :func:`small_rbm`, or for samplers of
+            any connectivity :func:`small_dbm` and :func:`small_machine` as well.
 
     Raises:
         AssertionError: Naming what the sampler got wrong.
@@ -77,8 +145,7 @@ def check_sampler(
     for replicas in ((), (3,), (2, 3)):
         rbm = make(replicas=replicas)
         before = [parameter.detach().clone() for parameter in rbm.parameters()]
-        v_data = rng.uniform((*replicas, n_data, rbm.n_visible), generator=rng.stream(1, "data"))
-        positive = positive_phase(rbm, v_data)
+        positive = positive_phase(rbm, _data(rbm, n_data, seed=1))
         global_state = torch.get_rng_state()
         answers = []
         for _ in range(2):
@@ -93,7 +160,7 @@ def check_sampler(
         _check(unchanged, f"{name} changed the model")
         first, second = (answer.configurations for answer in answers)
         _check(first.v.equal(second.v) and first.h.equal(second.h), f"{name}: same stream, other answer")
-        _check_declarations(sampler, rbm, v_data, first)
+        _check_declarations(sampler, rbm, n_data, first)
         _check_configurations(name, first, rbm)
         loss = contrast(rbm, positive, first)
         _check(loss.shape == replicas, f"{name}: contrast has shape {tuple(loss.shape)}, not {replicas}")
@@ -119,15 +186,23 @@ def _check_frozen(sampler: object) -> None:
         _check(False, f"{type(sampler).__name__}: the setting {setting!r} can be changed; freeze the class")
 
 
-def _check_declarations(sampler: Sampler, rbm: EnergyModel, v_data: Tensor, answer: Configurations) -> None:
+@torch.no_grad()
+def _data(model: EnergyModel, n: int, seed: int) -> Tensor:
+    """Rows that the visible units take: their means under random fields."""
+    field = torch.empty(*model.replicas, n, model.n_visible, dtype=torch.float32, device="cpu")
+    return model.visible.mean(field.normal_(std=2.0, generator=rng.stream(seed, "data")))
+
+
+def _check_declarations(sampler: Sampler, rbm: EnergyModel, n_data: int, answer: Configurations) -> None:
     """``uses_data`` and ``shared`` are there, and a sampler that denies using the data does not."""
     name = type(sampler).__name__
     for attribute in ("uses_data", "shared"):
         _check(isinstance(getattr(sampler, attribute, None), bool), f"{name}.{attribute} must be True or False")
     if not sampler.uses_data:
         generator = rng.stream(2, "negative_phase")
-        state = sampler.init(rbm, v_data.shape[-2], generator=generator)
-        other = sampler.sample(rbm, state, positive_phase(rbm, 1 - v_data), generator=generator).configurations
+        state = sampler.init(rbm, n_data, generator=generator)
+        positive = positive_phase(rbm, _data(rbm, n_data, seed=6))
+        other = sampler.sample(rbm, state, positive, generator=generator).configurations
         _check(other.v.equal(answer.v), f"{name} says uses_data = False, but other data give another answer")
 
 
@@ -136,9 +211,12 @@ def _check_configurations(name: str, configurations: Configurations, rbm: Energy
     _check(v.shape[:-2] == rbm.replicas, f"{name}: v has shape {tuple(v.shape)}, replicas are {rbm.replicas}")
     _check(v.shape[-1] == rbm.n_visible, f"{name}: last axis of v is {v.shape[-1]}, not {rbm.n_visible}")
     _check(h.shape == (*v.shape[:-1], rbm.n_hidden), f"{name}: h has shape {tuple(h.shape)}")
-    for unit_name, units in (("v", v), ("h", h)):
-        _check(not units.requires_grad, f"{name}: {unit_name} carries a gradient")
-        _check(bool(((units >= 0) & (units <= 1)).all()), f"{name}: {unit_name} leaves [0, 1]")
+    for layer, kind, x in (("v", rbm.visible, v), ("h", rbm.hidden, h)):
+        _check(not x.requires_grad, f"{name}: {layer} carries a gradient")
+        try:
+            kind.check(x)
+        except SettingError as error:
+            raise AssertionError(f"{name}: {layer} leaves what its units allow: {error}") from None
     if weight is not None:
         _check(weight.shape == v.shape[:-1], f"{name}: weight has shape {tuple(weight.shape)}")
         positive = bool((weight >= 0).all()) and bool((weight.sum(-1) > 0).all())

@@ -4,6 +4,7 @@ import importlib
 import sys
 import time
 import unittest
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,7 +25,15 @@ from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noq
 from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce, DimodSolver, Portfolio, Status  # noqa: E402
 from memcomp_lightning.solvers.dmm import DmmSolver  # noqa: E402
-from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine, small_rbm  # noqa: E402
+from memcomp_lightning.testing import (  # noqa: E402
+    check_sampler,
+    check_solver,
+    hidden_kinds,
+    small_dbm,
+    small_machine,
+    small_rbm,
+    visible_kinds,
+)
 
 SHORT = {"num_reads": 7, "num_sweeps": 50}
 
@@ -274,3 +283,18 @@ def test_what_is_not_known_is_warned_of_or_refused():
         MemcompSampler(BruteForce()).sample(bqm, num_reads=3)
     with pytest.raises(SettingError, match="time_limit = 0"):
         MemcompSampler().sample(bqm, time_limit=0)
+
+
+def test_reads_of_spins_and_of_no_other_units_than_those_of_two_values():
+    sampler = AnnealerSamples(sampler=SimulatedAnnealingSampler(), parameters=SHORT, beta="estimate")
+    visible, hidden = visible_kinds(), hidden_kinds()
+    for make in (small_rbm, small_machine):
+        check_sampler(sampler, make=partial(make, visible=visible["spins"], hidden=hidden["bits"]))
+    for layer, kind in (
+        ("visible", visible["categories"]),
+        ("visible", visible["real"]),
+        ("hidden", hidden["categories"]),
+    ):
+        message = f"{layer} units = '{type(kind).__name__}' is not allowed: expected units of two values"
+        with pytest.raises(SettingError, match=message):
+            sampler.init(small_rbm(**{layer: kind}), 3, generator=rng.stream(0, "negative_phase"))

@@ -2,14 +2,17 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import partial
 
 import pytest
 import torch
 
+from memcomp_lightning import rng
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.chains import sweep
+from memcomp_lightning.models.units import ReLU
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.problems import Qubo
 from memcomp_lightning.samplers import (
@@ -31,7 +34,15 @@ from memcomp_lightning.solvers import (
     TabuSearch,
 )
 from memcomp_lightning.solvers.dmm import BondField, DmmSolver, Heun, Recording, WarmRestart
-from memcomp_lightning.testing import check_sampler, check_solver, small_dbm, small_machine
+from memcomp_lightning.testing import (
+    check_sampler,
+    check_solver,
+    hidden_kinds,
+    small_dbm,
+    small_machine,
+    small_rbm,
+    visible_kinds,
+)
 from memcomp_lightning.training import Greedy
 from memcomp_lightning.types import Configurations, NegativePhase
 
@@ -91,6 +102,52 @@ SAMPLERS = {
 @pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
 def test_sampler_keeps_the_contract(sampler):
     check_sampler(sampler)
+
+
+V, H = visible_kinds(), hidden_kinds()
+MODELS = (
+    {f"RBM of {name} and spins": partial(small_rbm, visible=kind, hidden=H["spins"]) for name, kind in V.items()}
+    | {f"RBM of categories and {name}": partial(small_rbm, visible=V["categories"], hidden=H[name]) for name in H}
+    | {f"DBM of {name}": partial(small_dbm, visible=V[name]) for name in ("categories", "mixed")}
+    | {
+        f"machine of {name}": partial(small_machine, visible=V[name], hidden=H["spins"])
+        for name in ("spins", "categories of several sizes", "mixed")
+    }
+)
+FEW = {
+    "annealing": GibbsAnnealing(n_restarts=2, n_sweeps=3, kernel="reference"),
+    "the portfolio": Portfolio(n_restarts=3),
+    "the DMM": DmmSolver(n_restarts=3, max_steps=11),
+}
+OF_EVERY_KIND = {
+    name: SAMPLERS[name]
+    for name in ("CD-1", "CD-3", "PCD", "parallel tempering", "exact", "quench", "always the mode")
+} | {f"ground state by {name}": GroundState(solver=solver) for name, solver in FEW.items()}
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("name", OF_EVERY_KIND)
+def test_sampler_keeps_the_contract_with_units_of_every_kind(name, make):
+    sampler = OF_EVERY_KIND[name]
+    if isinstance(make().hidden, ReLU) and isinstance(sampler, GroundState | ModeAssisted):
+        with pytest.raises(
+            SettingError, match=r"units = 'ReLU' is not allowed: expected units with a form in bits"
+        ):
+            check_sampler(sampler, make=make)
+    else:
+        check_sampler(sampler, make=make)
+
+
+def test_what_some_units_cannot_do_is_refused_by_name():
+    real, of_states = small_rbm(visible=V["real"]), small_rbm(visible=V["categories"])
+    stream = rng.stream(0, "negative_phase")
+    with pytest.raises(SettingError, match=r"visible = 'mean' is not allowed: expected 'sample' for real units"):
+        CD(visible="mean").init(real, 3, generator=stream)
+    check_sampler(CD(visible="mean"), make=partial(small_rbm, visible=V["real of fixed precision"]))
+    check_sampler(CD(visible="mean"), make=partial(small_rbm, visible=V["categories"]))
+    with pytest.raises(SettingError, match=r"readout = 'time_average' is not allowed: expected 'best' for categ"):
+        SAMPLERS["time average"].init(of_states, 3, generator=stream)
+    check_sampler(SAMPLERS["time average"], make=partial(small_rbm, visible=V["real"], hidden=H["spins"]))
 
 
 OF_TWO_LAYERS = ("CD-1 of means",)
@@ -192,8 +249,11 @@ BROKEN_SAMPLERS = [
     (CarriesAGradient, "v carries a gradient"),
     (ChangesTheModel, "changed the model"),
     (IgnoresTheStream, "same stream, other answer"),
-    (with_configurations(v=lambda x, model: 2 * x.v - 1), r"v leaves \[0, 1\]"),
-    (with_configurations(h=lambda x, model: model.hidden_field(x.v).detach()), r"h leaves \[0, 1\]"),
+    (with_configurations(v=lambda x, model: 2 * x.v - 1), r"v leaves what its units allow: v in column"),
+    (
+        with_configurations(h=lambda x, model: model.hidden_field(x.v).detach()),
+        r"h leaves what its units allow: v in column",
+    ),
     (with_configurations(h=lambda x, model: x.h[..., 1:]), "h has shape"),
     (with_configurations(v=lambda x, model: x.v[..., 1:]), "last axis of v is 6, not 7"),
     (with_configurations(h=lambda x, model: model.hidden_mean(x.v)), "h carries a gradient"),
