@@ -8,11 +8,11 @@ from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache, partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
-from hydra.utils import get_class
+from hydra.utils import get_class, get_method
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
@@ -25,6 +25,7 @@ from memcomp_lightning.configuration.values import check_values, require_held_ou
 from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
 from memcomp_lightning.modules.trainers import PRECISIONS, check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
@@ -35,7 +36,7 @@ from memcomp_lightning.training import OptimizerFactory, Schedule
 from memcomp_lightning.training.schedules import check_schedules
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
-_OF_MODELS = ("data", "model", "solver", "sampler", "positive")
+_OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
 _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
 _SETTINGS = {
     "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
@@ -65,20 +66,21 @@ def build(config: DictConfig) -> Plan:
         numbers = isinstance(values, ListConfig) and all(isinstance(x, int | float) for x in values)
         require(numbers, f"tried.{name}", values, "a list of numbers")
     images = _loaded(instantiate(config.data.source))
-    network = _network(config, images)
+    units = _units(config.units, "units", images.layout.n_visible)
+    network = _network(config, images, units)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = stage_for = None
     models = energy_models(network)
     if models and config.pretrain.iterations > 0:
-        callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images)
+        callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images, units)
         centring = _part(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
-            start_at_means(models[0], data.train[0])
+            start_at_means(models[0], data.train[0], data.train_observed)
         schedules = _schedules(config, "pretrain")
         stage_for = instantiate(config.pretrain.stage)
         try:
@@ -122,7 +124,7 @@ def build(config: DictConfig) -> Plan:
             loss=config.finetune.loss,
             seed=seed,
         )
-        finetuning = Stage(classifier, _data(config, "finetune", images), callbacks)
+        finetuning = Stage(classifier, _data(config, "finetune", images, units), callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
     allowed = "an integer >= 1 where there is no pretraining"
@@ -163,22 +165,42 @@ def _schedules(config: DictConfig, stage: str) -> list[Schedule]:
     return found
 
 
-def _network(config: DictConfig, images: ImageData) -> nn.Module:
+def _units(settings: DictConfig, name: str, n_sites: int) -> Units:
+    """A layer of the kind that settings name, with so many units."""
+    require(isinstance(settings, DictConfig), name, settings, "settings by name with a _target_")
+    try:
+        units = instantiate(settings)(n_sites)
+    except TypeError as error:
+        raise UserError(f"{name}: {in_words(error)}") from error
+    require(isinstance(units, Units), name, type(units).__name__, "a kind of memcomp_lightning.models.units")
+    return cast(Units, units)
+
+
+def _network(config: DictConfig, images: ImageData, units: Units) -> nn.Module:
     settings = OmegaConf.to_container(config.model, resolve=True)
     assert isinstance(settings, dict)
     weights = settings.pop("weights", None)
     settings.pop("output_init", None)
     partitions, first = config.data.partitions, config.data.first_partitions
     require_count("data.partitions", partitions)
+    layout, parameters = images.layout, inspect.signature(get_class(settings["_target_"])).parameters
     arguments: dict[str, Any] = {
-        "n_visible": images.layout.n_visible,
         "replicas": (min(partitions, first or partitions),) if partitions > 1 else (),
         "generator": rng.stream(config.seed, "weights"),
+        **({"visible": units} if "visible" in parameters else {"n_visible": units.n}),
     }
-    if isinstance(settings.get("connectivity"), dict):
-        settings["connectivity"] = {**settings["connectivity"], "n_visible": images.layout.n_visible}
+    connectivity = settings.get("connectivity")
+    if isinstance(connectivity, dict) and "_target_" in connectivity:
+        of_picture = {"height": layout.height, "width": layout.width, "pixels": layout.pixels}
+        known = inspect.signature(get_method(connectivity["_target_"])).parameters
+        own = {name: value for name, value in of_picture.items() if name in known}
+        settings["connectivity"] = {**connectivity, **(own or {"n_visible": layout.n_visible})}
+    if "hidden" in settings:
+        require_count("model.n_hidden", settings["n_hidden"])
+        arguments["hidden"] = _units(config.model.hidden, "model.hidden", settings.pop("n_hidden"))
+        settings.pop("hidden")
     factory = instantiate(settings, _partial_=True, _convert_="all")
-    if "n_classes" in inspect.signature(get_class(settings["_target_"])).parameters:
+    if "n_classes" in parameters:
         arguments["n_classes"] = images.n_classes
     try:
         network: nn.Module = factory(**arguments)
@@ -205,10 +227,11 @@ def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
     return sampler
 
 
-def _data(config: DictConfig, stage: str, images: ImageData) -> ImageDataModule:
+def _data(config: DictConfig, stage: str, images: ImageData, units: Units) -> ImageDataModule:
     settings = {name: config.data[name] for name in _SETTINGS["data"] if name != "source"}
     try:
-        return ImageDataModule(images, batch_size=config[stage].batch_size, seed=config.seed, **settings)
+        size, seed = config[stage].batch_size, config.seed
+        return ImageDataModule(images, batch_size=size, seed=seed, units=units, **settings)
     except ValueError as error:
         raise UserError(f"{stage}, data: {error}") from error
 

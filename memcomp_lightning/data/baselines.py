@@ -1,5 +1,6 @@
 """What simple models reach on the same data: the numbers to compare a trained network with."""
 
+import copy
 import warnings
 
 import numpy as np
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from memcomp_lightning.data.mnist_files import cache_folder
+from memcomp_lightning.models import RBM, start_at_means
+from memcomp_lightning.models.units import Bernoulli, Units
 
 MOST_IMAGES = 20_000
 MOST_NUMBERS = 2_400_000
@@ -38,19 +41,35 @@ def logistic_regression(train: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor
         return _fit_and_score(*arrays)
 
 
-def independent_log_likelihood(train_v: Tensor, v: Tensor) -> float:
+def independent_log_likelihood(
+    train_v: Tensor,
+    v: Tensor,
+    units: Units | None = None,
+    *,
+    train_observed: Tensor | None = None,
+    observed: Tensor | None = None,
+) -> float:
     """Mean log-likelihood of images, in nats, under independent units with the means of the training images.
 
     Intensities between 0 and 1 are probabilities of a 1; the mean over their draws is taken. The means count one
-    more image with the unit on and one with it off, so that no probability is 0.
+    more image of each value, so that no probability is 0; real units that are learned have the variances as well.
 
     Args:
         train_v: ``(n, n_visible)``.
         v: The images to judge, ``(n_judged, n_visible)``.
+        units: Kind of the units; None is units in {0, 1}.
+        train_observed, observed: Where the values are known, masks; None is everywhere.
     """
-    mean = (train_v.double().sum(-2) + 1) / (train_v.shape[-2] + 2)
-    log_on, log_off = mean.log(), torch.log1p(-mean)
-    return float((v.double() @ (log_on - log_off)).mean() + log_off.sum())
+    units = Bernoulli(v.shape[-1]) if units is None else copy.deepcopy(units)
+    alone = RBM(visible=units, n_hidden=1).double()
+    start_at_means(alone, train_v.double(), train_observed)
+    v, bias = v.double(), alone.b.detach().unsqueeze(-2)
+    log_p = alone.visible.site_sums(v * bias) - alone.visible.cumulant(bias)
+    if observed is not None:
+        v = torch.where(observed, v, 0.0)
+        known = alone.visible.site_sums(observed.double()) > 0
+        log_p = torch.where(known, log_p, 0.0)
+    return float((log_p.sum(-1) - alone.visible.energy(v)).mean())
 
 
 def _fit_and_score(

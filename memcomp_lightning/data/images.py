@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.data.missing import split_missing
 from memcomp_lightning.errors import require, require_count
 
 
@@ -57,13 +58,15 @@ class ImageData:
     """A training set and a test set of labelled images.
 
     Args:
-        train_v: Intensities in [0, 1], float32, ``(n_train, n_visible)``.
+        train_v: Intensities in [0, 1], float32, ``(n_train, n_visible)``; NaN is a missing value.
         train_label: Class indices, int64, ``(n_train,)``.
         test_v: Intensities in [0, 1], float32, ``(n_test, n_visible)``.
         test_label: Class indices, int64, ``(n_test,)``.
         n_classes: Number of classes; labels run from 0 to ``n_classes - 1``.
         layout: Where the visible units lie in the picture.
         name: Name of the data set, for reports.
+        train_observed: Where ``train_v`` is known, a mask of its shape; None is wherever it is not NaN.
+        test_observed: The same of ``test_v``.
     """
 
     train_v: Tensor
@@ -73,11 +76,18 @@ class ImageData:
     n_classes: int
     layout: PixelLayout
     name: str
+    train_observed: Tensor | None = None
+    test_observed: Tensor | None = None
 
     def __post_init__(self) -> None:
         require_count("n_classes", self.n_classes)
-        _check("train", self.train_v, self.train_label, self)
-        _check("test", self.test_v, self.test_label, self)
+        for subset in ("train", "test"):
+            v, observed = getattr(self, f"{subset}_v"), getattr(self, f"{subset}_observed")
+            _check_shape(subset, v, self)
+            v, observed = split_missing(v, observed, subset)
+            object.__setattr__(self, f"{subset}_v", v)
+            object.__setattr__(self, f"{subset}_observed", observed)
+            _check(subset, v, getattr(self, f"{subset}_label"), self)
 
     @property
     def n_visible(self) -> int:
@@ -100,18 +110,21 @@ def same_patterns(
     return ImageData(train_v, train_label, v, label, n_classes, layout, name)
 
 
-def _check(subset: str, v: Tensor, label: Tensor, images: ImageData) -> None:
+def _check_shape(subset: str, v: Tensor, images: ImageData) -> None:
     name, n_visible = f"{subset}_v", images.layout.n_visible
     require(v.dtype == torch.float32, f"{name}.dtype", v.dtype, "torch.float32", "Convert with .float().")
     matches = v.ndim == 2 and v.shape[0] >= 1 and v.shape[1] == n_visible
     allowed = f"(n, {n_visible}): n >= 1 images of the {n_visible} units of the pixel layout"
     remedy = "Flatten each image, or give the layout that belongs to these images."
     require(matches, f"{name}.shape", tuple(v.shape), allowed, remedy)
+
+
+def _check(subset: str, v: Tensor, label: Tensor, images: ImageData) -> None:
+    name = f"{subset}_v"
     low, high = v.aminmax()
-    # A comparison with NaN is false, and aminmax returns NaN where there is one: this refuses NaN as well.
     if not (low >= 0 and high <= 1):
         row, unit = (~((v >= 0) & (v <= 1))).nonzero()[0].tolist()
-        remedy = "Scale the intensities (bytes: divide by 255) and replace missing values."
+        remedy = "Scale the intensities (bytes: divide by 255); NaN is a missing value."
         require(False, f"{name}[{row}, {unit}]", v[row, unit].item(), "a finite value in [0, 1]", remedy)
     name = f"{subset}_label"
     require(label.dtype == torch.int64, f"{name}.dtype", label.dtype, "torch.int64", "Convert with .long().")

@@ -10,7 +10,9 @@ from jaxtyping import Int
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.data.missing import split_missing
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.types import Batch
 
 
@@ -66,7 +68,8 @@ class Batches:
     number of chunks in a step. No image is repeated or left out.
 
     Args:
-        v: Intensities, ``(*replicas, n, n_visible)``; :class:`SparseRows` without replica axes.
+        v: Intensities, or data as ``units`` keep them, ``(*replicas, n, n_sites)``; :class:`SparseRows` without
+            replica axes. NaN is a missing value.
         label: Class indices, ``(*replicas, n)``.
         batch_size: Images of a replica in an optimiser step, over all processes, >= 1; the last step of a
             pass takes what is left. None, or n and more, means all n.
@@ -75,6 +78,9 @@ class Batches:
         rank, world_size: Index of this process, and how many there are.
         weight: How often each image counts in the mean over a step, > 0, ``(n,)``, without replica axes; None
             means once each.
+        observed: Where ``v`` is known, a mask of its shape; None is wherever it is not NaN.
+        units: Kind of the visible units, which makes entries of the data when a batch is taken, so that a category
+            takes a number in memory and no row of zeros; None takes the data as they are.
 
     >>> batches = Batches(torch.zeros(7, 2), torch.zeros(7).long(), 3, chunk_size=2, shuffle=True, seed=0)
     >>> [(len(batch.label), batch.closes_step) for batch in batches]
@@ -92,6 +98,8 @@ class Batches:
         rank: int = 0,
         world_size: int = 1,
         weight: Tensor | None = None,
+        observed: Tensor | None = None,
+        units: Units | None = None,
     ) -> None:
         filled = len(v.shape) >= 2 and v.shape.numel() > 0
         require(filled, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
@@ -112,10 +120,16 @@ class Batches:
             require(smallest > 0, "weight", smallest, "numbers > 0", "Leave out images that do not count.")
         # One chunk that is the whole pass: the order cannot matter, and the tensors go out uncopied.
         self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
+        sparse = isinstance(v, SparseRows)
+        fits = not sparse or (observed is None and units is None)
+        require(fits, "observed and units", "given", "None where images are in sparse rows")
+        if not isinstance(v, SparseRows):
+            v, observed = split_missing(v, observed, "v")
         # Contiguous, the images of all replicas are the rows of one matrix.
-        self._v, self._label, self._weight = v, label, weight
+        self._v, self._label, self._weight, self._observed, self._units = v, label, weight, observed, units
         if self._shuffle:
             self._v, self._label = v if isinstance(v, SparseRows) else v.contiguous(), label.contiguous()
+            self._observed = None if observed is None else observed.contiguous()
         self._world_size = world_size
         self._seeds: tuple[int, ...] = (seed,)
         self._replicas = tuple(label.shape[:-1])
@@ -137,6 +151,8 @@ class Batches:
             n, units = self._v.shape[-2:]
             repeated._v = self._v.reshape(-1, n, units).repeat(len(seeds), 1, 1)
             repeated._label = self._label.reshape(-1, n).repeat(len(seeds), 1)
+            if self._observed is not None:
+                repeated._observed = self._observed.reshape(-1, n, units).repeat(len(seeds), 1, 1)
         return repeated
 
     def to(self, device: torch.device | str) -> "Batches":
@@ -144,6 +160,8 @@ class Batches:
         moved = copy.copy(self)
         moved._v, moved._label = self._v.to(device), self._label.to(device)
         moved._weight = None if self._weight is None else self._weight.to(device)
+        moved._observed = None if self._observed is None else self._observed.to(device)
+        moved._units = None if self._units is None else copy.deepcopy(self._units).to(device)
         return moved
 
     @property
@@ -183,24 +201,30 @@ class Batches:
         self._resume = self._progress = dict(state)
 
     def _batch(self, chunk: "_Chunk", order: Tensor | None) -> Batch:
-        v, label, positions = self._v, self._label, chunk.positions
-        if isinstance(v, SparseRows):
-            rows = torch.arange(len(label), device=label.device) if order is None else order
-            v, label = v.dense(rows[positions]), label[rows[positions]]
-        elif order is None:
-            v, label = v[..., positions, :], label[..., positions]
+        positions, observed = chunk.positions, None
+        if isinstance(self._v, SparseRows):
+            n = len(self._label)
+            rows = torch.arange(n, device=self._label.device)[positions] if order is None else order[positions]
+            v, label = self._v.dense(rows), self._label[rows]
         else:
-            # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
-            # of torch.take_along_dim, which looks up each single value.
-            index = order[..., positions]
-            v = v.flatten(0, -2).index_select(0, index.flatten()).view(*index.shape, -1)
-            label = label.flatten().index_select(0, index.flatten()).view(index.shape)
+            index = None if order is None else order[..., positions]
+            v, label = _taken(self._v, positions, index), self._labels(positions, index)
+            if self._observed is not None:
+                observed = _taken(self._observed, positions, index)
+            if self._units is not None:
+                v = self._units.encode(v, check=False)
+                observed = None if observed is None else self._units.over_sites(observed)
         if self._weight is None:
-            return Batch(v, label, chunk.share, chunk.closes_step)
+            return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
         weights = self._weight if order is None else self._weight[order]
         weight = weights[positions]
         share = self._world_size * float(weight.sum()) / float(weights[chunk.step].sum())
-        return Batch(v, label, share, chunk.closes_step, weight)
+        return Batch(v, label, share, chunk.closes_step, weight, observed)
+
+    def _labels(self, positions: slice, index: Tensor | None) -> Tensor:
+        if index is None:
+            return self._label[..., positions]
+        return self._label.flatten().index_select(0, index.flatten()).view(index.shape)
 
     def _order(self) -> Int[Tensor, "*replicas n"]:
         """Return this epoch's order, as rows of all replicas' images laid end to end."""
@@ -224,6 +248,15 @@ class _Chunk(NamedTuple):
     step: slice
     share: float
     closes_step: bool
+
+
+def _taken(v: Tensor, positions: slice, index: Tensor | None) -> Tensor:
+    """Rows by their positions, or by their places among those of all replicas."""
+    if index is None:
+        return v[..., positions, :]
+    # Whole rows are copied out of (all images, n_visible): for replicas that takes a sixth of the time
+    # of torch.take_along_dim, which looks up each single value.
+    return v.flatten(0, -2).index_select(0, index.flatten()).view(*index.shape, -1)
 
 
 def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size: int) -> list[_Chunk]:

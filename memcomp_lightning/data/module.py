@@ -1,5 +1,7 @@
 """The images of one experiment, dealt into replicas and held-out parts, as Lightning wants them."""
 
+from typing import Any, NamedTuple
+
 import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
@@ -8,6 +10,18 @@ from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.loading import Batches
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.units import Bernoulli, Units
+
+
+class _Kept(NamedTuple):
+    """Some of the images, as the units keep them: ``(*replicas, n, n_sites)``."""
+
+    v: Tensor
+    label: Tensor
+    observed: Tensor | None
+
+    def at(self, index: Tensor) -> "_Kept":
+        return _Kept(self.v[index], self.label[index], None if self.observed is None else self.observed[index])
 
 
 class ImageDataModule(LightningDataModule):
@@ -22,12 +36,12 @@ class ImageDataModule(LightningDataModule):
     Held-out and test images come unshuffled, all of them in each process, as one step in chunks: the sum of
     ``share * mean over the chunk`` is the mean over the set.
 
+    Batches hold values of the visible units: the kind of these says which ones stand for the grey values.
+
     Attributes:
         replicas: Leading axes of the batches: ``()``, or the number of parts in use, ``(n,)``.
         n_train: Training images of one replica, without those held out.
-        train: Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out.
-        test: Test images ``(n, n_visible)`` and labels ``(n,)``.
-        heldout: The images of the validation: those held out, or the test images, which all replicas share.
+        units: The kind of the visible units: ``RBM(visible=data.units, ...)``.
 
     Args:
         images: The data.
@@ -40,6 +54,7 @@ class ImageDataModule(LightningDataModule):
         chunk_size: Images of a replica in one Batch at most, >= 1: bounds the memory of large steps.
         seed: Seed of the order in which training images come.
         partition_seed: Seed of the partition and of the held-out images.
+        units: Kind of the visible units, with a site for each pixel; None is units in {0, 1}.
     """
 
     def __init__(
@@ -53,8 +68,12 @@ class ImageDataModule(LightningDataModule):
         chunk_size: int = 10_000,
         seed: int = 0,
         partition_seed: int = 0,
+        units: Units | None = None,
     ) -> None:
         super().__init__()
+        self.units = Bernoulli(images.n_visible) if units is None else units
+        n_sites, allowed = self.units.n_sites, f"{images.n_visible}, one for each pixel"
+        require(n_sites == images.n_visible, "number of sites of the units", n_sites, allowed)
         n_part, n_held_out = _split(images, partitions, validation_fraction, partition_seed)
         n_parts = partitions
         if first_partitions is not None:
@@ -64,22 +83,52 @@ class ImageDataModule(LightningDataModule):
         self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
         self.n_train = n_part - n_held_out
-        self.train = images.train_v, images.train_label
-        self.test = self.heldout = images.test_v, images.test_label
+        self._train, self._test = self._kept("train"), self._kept("test")
+        self._heldout = self._test
         # Without parts and without a held-out set there is nothing to deal, and no copy of the images.
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
             order = torch.randperm(len(images.train_label), generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
-            self.train = self._take(order[..., : self.n_train])
+            everything = self._train
+            self._train = everything.at(order[..., : self.n_train])
             if n_held_out:
-                self.heldout = self._take(order[..., self.n_train :])
+                self._heldout = everything.at(order[..., self.n_train :])
         self.train_batches(rank=0, world_size=1)
+
+    @property
+    def train(self) -> tuple[Tensor, Tensor]:
+        """Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
+        return self._values(self._train)
+
+    @property
+    def train_observed(self) -> Tensor | None:
+        """Where the training images are known, a mask of their shape; None is everywhere."""
+        return self._mask(self._train)
+
+    @property
+    def test(self) -> tuple[Tensor, Tensor]:
+        """Test images ``(n, n_visible)`` and labels ``(n,)``."""
+        return self._values(self._test)
+
+    @property
+    def heldout(self) -> tuple[Tensor, Tensor]:
+        """The images of the validation: those held out, or the test images, which all replicas share."""
+        return self._values(self._heldout)
+
+    @property
+    def heldout_observed(self) -> Tensor | None:
+        """Where they are known."""
+        return self._mask(self._heldout)
 
     @property
     def validation(self) -> tuple[Tensor, Tensor] | None:
         """Held-out training images ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
-        return None if self.heldout is self.test else self.heldout
+        return None if self._heldout is self._test else self.heldout
+
+    def values_of(self, intensity: Tensor) -> Tensor:
+        """Values of the visible units that stand for grey values, ``(..., n_pixels)`` to ``(..., n_visible)``."""
+        return self.units.encode(self.units.from_intensity(intensity), check=False)
 
     @property
     def n_at_once(self) -> int:
@@ -88,8 +137,8 @@ class ImageDataModule(LightningDataModule):
 
     @property
     def n_visible(self) -> int:
-        """Number of visible units."""
-        return self.images.n_visible
+        """Number of visible units; of categories a site has one for each state."""
+        return self.units.n
 
     @property
     def n_classes(self) -> int:
@@ -109,31 +158,44 @@ class ImageDataModule(LightningDataModule):
 
     def val_dataloader(self) -> Batches:
         """Return the held-out images, or the test images if none are held out."""
-        return self._evaluation_batches(*self.heldout)
+        return self._evaluation_batches(self._heldout)
 
     def test_dataloader(self) -> Batches:
         """Return the test images, the same for every replica."""
-        return self._evaluation_batches(*self.test)
+        return self._evaluation_batches(self._test)
 
     def train_batches(self, rank: int, world_size: int) -> Batches:
         """Return the shuffled training batches of one of ``world_size`` processes."""
         return Batches(
-            *self.train,
+            self._train.v,
+            self._train.label,
             batch_size=self._batch_size,
             chunk_size=self._chunk_size,
             shuffle=True,
             seed=self._seed,
             rank=rank,
             world_size=world_size,
+            observed=self._train.observed,
+            units=self.units,
         )
 
-    def _evaluation_batches(self, v: Tensor, label: Tensor) -> Batches:
+    def _evaluation_batches(self, kept: _Kept) -> Batches:
+        v, label, observed = kept
         if label.ndim == 1:
             v, label = v.expand(*self.replicas, -1, -1), label.expand(*self.replicas, -1)
-        return Batches(v, label, batch_size=None, chunk_size=self._chunk_size, shuffle=False, seed=self._seed)
+            observed = None if observed is None else observed.expand(*self.replicas, -1, -1)
+        settings: dict[str, Any] = {"chunk_size": self._chunk_size, "shuffle": False, "seed": self._seed}
+        return Batches(v, label, None, **settings, observed=observed, units=self.units)
 
-    def _take(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        return self.images.train_v[index], self.images.train_label[index]
+    def _kept(self, subset: str) -> _Kept:
+        v, label, observed = (getattr(self.images, f"{subset}_{name}") for name in ("v", "label", "observed"))
+        return _Kept(self.units.from_intensity(v), label, observed)
+
+    def _values(self, kept: _Kept) -> tuple[Tensor, Tensor]:
+        return self.units.encode(kept.v, check=False), kept.label
+
+    def _mask(self, kept: _Kept) -> Tensor | None:
+        return None if kept.observed is None else self.units.over_sites(kept.observed)
 
 
 def _split(images: ImageData, partitions: int, validation_fraction: float, partition_seed: int) -> tuple[int, int]:

@@ -54,6 +54,25 @@ def grid(n_rows: int, n_columns: int) -> Pairs:
     return from_pairs(at.numel(), torch.cat((right, down)))
 
 
+def neighbours(height: int, width: int, pixels: Sequence[int] | None = None) -> Pairs:
+    """Neighbours in a picture of which only some pixels are units.
+
+    Args:
+        height: Rows of the picture, >= 1.
+        width: Columns of the picture, >= 1.
+        pixels: Pixel of each unit, counted row by row from 0; None means all of them, in order.
+
+    >>> neighbours(2, 2, [3, 0, 1]).tolist()
+    [[0, 2], [1, 2]]
+    """
+    pairs = grid(height, width)
+    if pixels is None:
+        return pairs
+    unit_of = {pixel: unit for unit, pixel in enumerate(pixels)}
+    kept = [(unit_of[a], unit_of[b]) for a, b in pairs.tolist() if a in unit_of and b in unit_of]
+    return from_pairs(len(pixels), kept)
+
+
 def from_graph(graph: Any) -> Pairs:
     """Edges of a networkx graph, its nodes numbered in ascending order: ``dwave.graphs.zephyr_graph(2)``, say."""
     number = {node: index for index, node in enumerate(sorted(graph.nodes))}

@@ -10,7 +10,7 @@ from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.training import FINETUNING_SGD, LOSSES, ClassifierStep, OptimizerFactory, Schedule, score
-from memcomp_lightning.training.score import score_of
+from memcomp_lightning.training.score import require_complete, score_of
 from memcomp_lightning.types import Batch
 
 
@@ -64,6 +64,7 @@ class Classifier(StageModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of held-out images."""
+        require_complete(batch)
         return {"score": score(self(batch.v), batch.label, self.loss)}
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:

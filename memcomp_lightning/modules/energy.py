@@ -249,14 +249,16 @@ class EnergyPretraining(StageModule):
             "loss": loss.detach(),
             "contrast": gap.detach(),
             "v": v,
+            "observed": batch.observed if self.phase.complete is None else None,
             "positive": positive,
             "negative": negative.configurations,
             "info": {**inferred, **negative.info},
         }
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """Return the model's visible states ``v`` of held-out images, for the callbacks."""
-        return {"v": self.phase.visible_of(batch.v)}
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor | None]:
+        """Return the model's visible states ``v`` of held-out images, and where they are known."""
+        v, observed = self.phase.seen_of(batch, rng.stream(self.seed, "validation", batch_idx))
+        return {"v": v, "observed": observed}
 
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains, the offsets and the energy gaps."""

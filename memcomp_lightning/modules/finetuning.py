@@ -52,5 +52,5 @@ class DBNClassifier(Classifier):
         self.dbn = dbn
 
     def parameters_at_rest(self) -> Iterable[Parameter]:
-        """The visible biases: a feed-forward pass does not use them."""
-        return (rbm.b for rbm in self.dbn)
+        """The visible biases, and what the visible units have of their own: a feed-forward pass uses neither."""
+        return (parameter for rbm in self.dbn for parameter in (rbm.b, *rbm.visible.parameters()))

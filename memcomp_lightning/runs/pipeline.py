@@ -144,15 +144,17 @@ def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     """What simple models reach on the same data; of several parts of the training set, on the first."""
     data = plan.stages[0].data
     (train, label), (heldout, _) = data.train, data.heldout
+    masks = {"train_observed": data.train_observed, "observed": data.heldout_observed}
     if data.replicas:
         train, label = train[0], label[0]
         heldout = heldout if heldout.ndim == 2 else heldout[0]
+        masks = {name: mask[0] if mask is not None and mask.ndim == 3 else mask for name, mask in masks.items()}
     context: dict[str, Any] = {}
     if "test_accuracy" in result:
         accuracy = logistic_regression((train, label), data.test)
         context["logistic_regression"] = {"test_accuracy": accuracy, "n_images": n_fitted(train)}
     if any("log_likelihood" in record for record in result["stages"].values()):
-        context["independent_units"] = {"heldout": independent_log_likelihood(train, heldout)}
+        context["independent_units"] = {"heldout": independent_log_likelihood(train, heldout, data.units, **masks)}
     return context
 
 

@@ -17,6 +17,7 @@ from torch.nn import Parameter
 from memcomp_lightning.models import DBN, RBM, BatchNorm, BatchNormReluNetwork, Linear
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.training.losses import Loss, cross_entropy, squared_error
+from memcomp_lightning.training.score import require_complete
 from memcomp_lightning.types import Batch
 
 
@@ -37,6 +38,7 @@ class ClassifierStep:
 
     def add_gradient(self, batch: Batch) -> None:
         """Add the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
+        require_complete(batch)
         if self._closed_form is None:
             self.loss(batch)[0].backward()
             return
@@ -45,6 +47,7 @@ class ClassifierStep:
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Return ``share * mean loss``, summed over the replicas, to be differentiated once, losses and logits."""
+        require_complete(batch)
         if self._closed_form is None:
             logits = self._network(batch.v)
             losses = self._loss(logits, batch.label)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from memcomp_lightning.errors import require
 from memcomp_lightning.training.losses import Loss, cross_entropy
 from memcomp_lightning.types import Batch
 
@@ -56,6 +57,15 @@ def evaluate(network: nn.Module, batches: Iterable[Batch], loss: Loss = cross_en
     was_training = network.training
     network.eval()
     like = next(network.parameters())
-    scores = [score(network(batch.v.to(like)), batch.label.to(like.device), loss) for batch in batches]
+    scores = []
+    for batch in batches:
+        require_complete(batch)
+        scores.append(score(network(batch.v.to(like)), batch.label.to(like.device), loss))
     network.train(was_training)
     return sum(scores[1:], start=scores[0])
+
+
+def require_complete(batch: Batch) -> None:
+    """Raise a SettingError where values are missing, for which a classifier has no input."""
+    remedy = "Pretrain alone (finetune.iterations=0), or fill them in first."
+    require(batch.observed is None, "missing values", "in the data of a classifier", "none", remedy)

@@ -133,6 +133,28 @@ class Units(nn.Module):
             column: Number of the first entry, for the error.
         """
 
+    def from_intensity(self, v: PerSite) -> Tensor:
+        """Data, as they are kept, that stand for grey values in [0, 1]: one column a site."""
+        raise self._without("a reading of grey values")
+
+    def to_intensity(self, x: Values) -> PerSite:
+        """Grey values that data, or their means, stand for: an affine function, for pictures."""
+        raise self._without("a reading of grey values")
+
+    def encode(self, kept: Tensor, *, check: bool = True) -> Values:
+        """Entries of data as they are kept, one column a site: the same, but for categories.
+
+        Args:
+            kept: Data, ``(..., n_sites)``.
+            check: Whether numbers that are no state are looked for and refused.
+        """
+        return kept
+
+    def values_of(self, mean: Values, *, generator: Generator) -> Values:
+        """Draw values of data that may be means in between, as grey values are; real ones stay."""
+        drawn = self.sample_of_mean(mean, generator=generator)
+        return mean if drawn is None else drawn
+
     @abstractmethod
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """The bias of units without couplings that have the means of n rows of this sum.

@@ -65,6 +65,14 @@ class Bernoulli(Units):
                 v, (v >= 0) & (v <= 1), observed, column, "values in [0, 1] for Bernoulli units", remedy
             )
 
+    def from_intensity(self, v: PerSite) -> Tensor:
+        """Grey values themselves, as probabilities of a 1."""
+        return v
+
+    def to_intensity(self, x: Values) -> PerSite:
+        """The values themselves."""
+        return x
+
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Log (n_on + 1) / (n_off + 1)."""
         return torch.log((total + 1) / (n - total + 1))

@@ -153,12 +153,25 @@ class Categorical(Units):
         """Entries less their mean over the states of their site."""
         return x - self.over_sites(self.site_sums(x) / torch.tensor(self.sizes, device=x.device))
 
-    def encode(self, states: Tensor) -> Tensor:
+    def from_intensity(self, v: PerSite) -> Tensor:
+        """Numbers of states: levels of grey from 0, black, to q - 1, white; a byte each where that is enough."""
+        numbers = (v * (torch.tensor(self.sizes, device=v.device) - 1)).round()
+        return numbers.to(torch.uint8 if self._widest <= 256 else torch.long)
+
+    def to_intensity(self, x: Values) -> PerSite:
+        """The mean level of each site over q - 1."""
+        level = torch.arange(self.n, device=x.device) - self._begin[self._site]
+        return self.site_sums(x * level / self.over_sites(self._last(x).clamp(min=1)))
+
+    def encode(self, states: Tensor, *, check: bool = True) -> Tensor:
         """Entries of numbers of states, ``(..., n_sites)`` to ``(..., n)`` float32.
 
         Raises:
             SettingError: A number that is no state of its site.
         """
+        like = torch.empty(0, dtype=torch.float32, device=states.device)
+        if not check:
+            return self._one_hot(states.long(), like)
         fits = states.ndim >= 1 and states.shape[-1] == self.n_sites
         require(fits, "shape of states", tuple(states.shape), f"(..., {self.n_sites})")
         index = states.long()
@@ -169,7 +182,7 @@ class Categorical(Units):
             row = f", row {place[-2]}" if len(place) > 1 else ""
             name, allowed = f"state in column {place[-1]}{row}", f"an integer from 0 to q - 1 = {size - 1}"
             require(False, name, states[tuple(place)].item(), allowed)
-        return self._one_hot(index, torch.empty(0, dtype=torch.float32, device=states.device))
+        return self._one_hot(index, like)
 
     def decode(self, v: Values) -> Tensor:
         """The likeliest state of each site, ``(..., n)`` to ``(..., n_sites)`` int64."""

@@ -103,6 +103,14 @@ class Gaussian(Units):
         remedy = "Mark missing values by a mask."
         require_values(v, v.isfinite(), observed, column, "finite values for Gaussian units", remedy)
 
+    def from_intensity(self, v: PerSite) -> Tensor:
+        """Grey values themselves."""
+        return v
+
+    def to_intensity(self, x: Values) -> PerSite:
+        """The values themselves, which may be outside of [0, 1]."""
+        return x
+
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Mean times precision."""
         return total / n * self.precision

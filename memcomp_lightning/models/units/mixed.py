@@ -128,6 +128,16 @@ class Mixed(Units):
             kind.check(part, mask, pure=pure, column=column)
             column += kind.n
 
+    def encode(self, kept: Tensor, *, check: bool = True) -> Values:
+        """Of each part."""
+        parts = kept.split([kind.n_sites for kind in self.kinds], dim=-1)
+        found = [kind.encode(part, check=check) for kind, part in zip(self.kinds, parts, strict=True)]
+        return torch.cat(found, dim=-1)
+
+    def values_of(self, mean: Values, *, generator: Generator) -> Values:
+        """Of each part."""
+        return self._each(lambda kind, part: kind.values_of(part, generator=generator), mean)
+
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Of each part."""
         counts: Sequence[float | Tensor] = self._split(n) if isinstance(n, Tensor) else [n] * len(self.kinds)

@@ -58,6 +58,14 @@ class Spin(Units):
         else:
             require_values(v, (v >= -1) & (v <= 1), observed, column, "values in [-1, 1] for spins", remedy)
 
+    def from_intensity(self, v: PerSite) -> Tensor:
+        """2 v - 1: between black and white they are means."""
+        return 2 * v - 1
+
+    def to_intensity(self, x: Values) -> PerSite:
+        """(x + 1) / 2."""
+        return (x + 1) / 2
+
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Half of log (n_up + 1) / (n_down + 1)."""
         n_up = (n + total) / 2

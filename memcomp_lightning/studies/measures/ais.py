@@ -16,10 +16,11 @@ FANTASY_SWEEPS = 200
 
 def scoring(data: ImageDataModule, n_reported: int) -> Scoring:
     """Score by AIS, whose log Z tends to be too small, and by reverse AIS, whose log Z tends to be too large."""
-    negative, v = negative_log_likelihood(data, n_reported), data.images.train_v
-    base, annealing = base_of(v), Ais()
+    negative, v = negative_log_likelihood(data, n_reported), data.values_of(data.images.train_v)
+    annealing = Ais()
 
     def measure(model: EnergyModel) -> Scores:
+        base = base_of(v, model.visible)
         up = annealing.estimate(model, generator=rng.stream(0, "ais"), base=base)
         start, generator = v[: annealing.n_chains].expand(*model.replicas, -1, -1), rng.stream(0, "fantasies")
         two_layers, base_of_two, samples = _of_two_layers(model, base, start, generator)
@@ -41,5 +42,5 @@ def _of_two_layers(
     layers = as_two_layers(model)
     if layers.units is None:
         return layers.rbm, base, v
-    x = torch.cat((v, rng.bernoulli(model.hidden_mean(v), generator=generator)), dim=-1)
+    x = torch.cat((v, model.hidden.values_of(model.hidden_mean(v), generator=generator)), dim=-1)
     return layers.rbm, base_on_first_class(model, base), layers.first(x)

@@ -54,7 +54,7 @@ def negative_log_likelihood(data: ImageDataModule, n_reported: int) -> Callable[
     if data.validation is None:
         allowed = "above 0 where log-likelihoods are measured: held-out images choose the learning rates"
         raise SettingError(f"data.validation_fraction = 0.0 is not allowed: expected {allowed}.")
-    test_v, (held_out_v, _) = data.images.test_v, data.validation
+    (test_v, _), (held_out_v, _) = data.test, data.validation
 
     def negative(model: EnergyModel, log_z: Tensor) -> Tensor:
         by_test, by_held_out = (-log_likelihood_or_bound(model, v, log_z).mean(-1) for v in (test_v, held_out_v))

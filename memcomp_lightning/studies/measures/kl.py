@@ -7,7 +7,7 @@ from memcomp_lightning.studies.measures.base import Measure, Scores, Scoring
 
 def scoring(data: ImageDataModule, n_reported: int) -> Scoring:
     """By the data set itself, which every replica learns from."""
-    v = data.images.train_v
+    v = data.values_of(data.images.train_v)
     return lambda model: Scores(kl_divergence(model, v))
 
 

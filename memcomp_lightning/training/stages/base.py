@@ -49,11 +49,15 @@ class Phase:
 
     def positive_of(self, batch: Batch, generator: Generator) -> tuple[Tensor, PositivePhase]:
         """What the model sees of a batch, and its positive phase."""
+        v, observed = self.seen_of(batch, generator)
+        return v, self.positive(v, observed, generator)
+
+    def seen_of(self, batch: Batch, generator: Generator) -> tuple[Tensor, Tensor | None]:
+        """What the model sees of a batch, and where it is known; None is everywhere."""
         v, observed = batch.v, batch.observed
         if observed is not None and self.complete is not None:
             v, observed = self.complete(v, observed, generator), None
-        v = self.visible_of(v)
-        return v, self.positive(v, observed, generator)
+        return self.visible_of(v), observed
 
 
 class PretrainingStage(Protocol):

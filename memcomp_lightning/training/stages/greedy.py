@@ -17,12 +17,16 @@ class Greedy:
     Activations are computed batch by batch and never held for the whole data set.
 
     Args:
-        network: The DBN; trained in place.
+        network: The DBN, or a single RBM; trained in place.
     """
 
-    def __init__(self, network: DBN) -> None:
-        require_dbn(network)
+    def __init__(self, network: DBN | RBM) -> None:
         self.network = network
+        if isinstance(network, RBM):
+            positive = partial(_hidden_means, network)
+            self.phases = [Phase(name="layer 1", tag="layer1", model=network, positive=positive)]
+            return
+        require_dbn(network)
         self.phases = [_phase(network, layer) for layer in range(len(network))]
 
     def hand_over(self) -> None:

@@ -52,7 +52,7 @@ def test_valid_data_are_accepted():
     assert data.n_visible == 3
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), -0.25, 1.5])
+@pytest.mark.parametrize("value", [float("inf"), -float("inf"), -0.25, 1.5])
 @pytest.mark.parametrize("name", ["train_v", "test_v"])
 def test_intensity_out_of_range_is_named_with_its_index(name, value):
     changes = {name: with_value(value)}
