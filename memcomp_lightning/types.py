@@ -16,7 +16,8 @@ class Configurations(NamedTuple):
     Attributes:
         v: Visible units, ``(*replicas, n, n_visible)``.
         h: Hidden units, samples or conditional means, ``(*replicas, n, n_hidden)``.
-        weight: Unnormalised weights >= 0, ``(*replicas, n)``; None means uniform.
+        weight: Unnormalised weights with a sum > 0, ``(*replicas, n)``; None means uniform. They are >= 0 but for
+            a sampler of ``signed_weights``, where the gradient of the mean energy is what counts.
     """
 
     v: Tensor

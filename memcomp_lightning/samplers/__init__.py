@@ -15,6 +15,7 @@ from memcomp_lightning.samplers.positive import (
     PositivePhase,
     PositivePhaseSampler,
 )
+from memcomp_lightning.samplers.pseudo_likelihood import PseudoLikelihood
 from memcomp_lightning.samplers.quench import Quench
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "ParallelTempering",
     "PositivePhase",
     "PositivePhaseSampler",
+    "PseudoLikelihood",
     "Quench",
     "positive_phase",
     "tensors_of",

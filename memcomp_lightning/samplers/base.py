@@ -71,6 +71,9 @@ class NegativePhaseSampler(Protocol[ModelT, StateT]):
             one call serves an update however many chunks its images come in.
         shared: The answer depends on the model alone, so with several processes one of them computes it for
             all. Otherwise every process draws its own.
+
+    A sampler whose configurations may have negative weights says ``signed_weights = True`` as well: the gradient
+    of their mean energy is right, and no configuration is a draw from a distribution.
     """
 
     uses_data: ClassVar[bool]

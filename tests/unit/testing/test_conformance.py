@@ -23,6 +23,7 @@ from memcomp_lightning.samplers import (
     ModeAssisted,
     ModeSchedule,
     ParallelTempering,
+    PseudoLikelihood,
     Quench,
 )
 from memcomp_lightning.solvers import (
@@ -87,6 +88,8 @@ SAMPLERS = {
     "always the mode": ModeAssisted(inner=PCD(), mode=GroundState(solver=BruteForce()), schedule=ALWAYS),
     "never the mode": ModeAssisted(inner=PCD(), mode=GroundState(solver=BruteForce()), schedule=NEVER),
     "exact": Exact(),
+    "pseudo-likelihood": PseudoLikelihood(),
+    "pseudo-likelihood of two sites": PseudoLikelihood(n_sites=2),
     "quench": Quench(),
     "quench, one start an image": Quench(n_chains=None),
     "time average": GroundState(
