@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Bernoulli
 
@@ -29,7 +30,10 @@ def in_bits(model: RBM) -> InBits | None:
         return InBits(model, zero)
     if model.visible.real or model.hidden.real:
         return None
-    visible, hidden = model.visible.bits(), model.hidden.bits()
+    try:
+        visible, hidden = model.visible.bits(), model.hidden.bits()
+    except SettingError:  # a kind of one's own need not have any
+        return None
     if visible.groups or hidden.groups:
         return None
     like = zero

@@ -20,7 +20,7 @@ from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
 from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible
 from memcomp_lightning.models.machine import log2_states
-from memcomp_lightning.models.observed import log_weight_of_hidden
+from memcomp_lightning.models.observed import check_mask, log_weight_of_hidden
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import all_states
 
@@ -130,6 +130,8 @@ def log_likelihood(
         SettingError: v has values that the units do not take, or the wrong shape; too many hidden units would have
             to be enumerated.
     """
+    if observed is not None:
+        check_mask(model, v, observed)
     v = pure_values(model, v, observed)
     if observed is not None:
         return _log_sum_of_observed(model, v, observed) - log_z.double().unsqueeze(-1)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.errors import require
 from memcomp_lightning.likelihood.boltzmann import double_of, log_hidden_sum
 from memcomp_lightning.likelihood.layers import in_chunks
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
@@ -165,6 +166,8 @@ def _discrete(log_weight: LogWeight, rows: Tensor, sites: _Sites) -> Tensor:
 def _real(log_weight: LogWeight, model: EnergyModel, rows: Tensor, entry: int) -> Tensor:
     """Of a real unit: its density given the others, its integral by the trapezoidal rule."""
     curvature = model.visible.curvature
+    known = curvature is not None and bool((curvature[..., entry] > 0).all())
+    require(known, "visible units", type(model.visible).__name__, "real units that have a precision, as Gaussian")
     assert curvature is not None
     precision = curvature[..., entry]
     reach, deviation = _reach(model, entry), precision.rsqrt()

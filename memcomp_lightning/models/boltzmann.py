@@ -125,7 +125,8 @@ class BoltzmannMachine(Machine):
         self.coupling = nn.Parameter(draw)
         self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(draw.new_zeros(*replicas, hidden.n))
-        coloured = [torch.isin(site_of, sites).nonzero().flatten() for sites in colouring(n_sites, site_pairs)]
+        classes_of_sites = _classes(n_sites, site_pairs, site_of[:n_visible][_is_real(visible)].unique())
+        coloured = [torch.isin(site_of, sites).nonzero().flatten() for sites in classes_of_sites]
         classes = sorted(coloured, key=lambda units: -int((units < n_visible).sum()))
         kinds = [_kind_of(self.visible, self.hidden, units) for units in classes]
         # Without parameters of their own they stay as they are, and are not made anew at each sweep.
@@ -369,16 +370,33 @@ def _kind_of(visible: Units, hidden: Units, entries: Tensor) -> Units:
     return side_by_side(visible.select(entries[seen]), hidden.select(entries[~seen] - visible.n))
 
 
+def _is_real(units: Units) -> Tensor:
+    """Which entries are real, ``(n,)``."""
+    if isinstance(units, Mixed):
+        return torch.cat([_is_real(kind) for kind in units.kinds])
+    return torch.full((units.n,), units.real, dtype=torch.bool)
+
+
+def _classes(n_sites: int, pairs: Pairs, real: Tensor) -> list[Tensor]:
+    """Classes of sites without couplings inside; all real ones are in one, as no other class has a list of states."""
+    classes = colouring(n_sites, pairs)
+    if sum(bool(torch.isin(sites, real).any()) for sites in classes) <= 1:
+        return classes
+    number = torch.arange(n_sites)
+    number[real] = real[0]
+    ends, _ = number[pairs].sort(dim=-1)
+    apart = colouring(n_sites, ends.unique(dim=0))
+    found = []
+    for sites in apart:
+        own = sites[~torch.isin(sites, real)]
+        found.append(torch.cat((own, real)).sort().values if bool((sites == real[0]).any()) else own)
+    return [sites for sites in found if len(sites)]
+
+
 def _refuse_real_pairs(visible: Units, pairs: Pairs) -> None:
     """Raise if two real units are coupled: the energy need not be bounded then."""
-    if not visible.real:
-        return
-    discrete = torch.zeros(int(pairs.max()) + 1 if len(pairs) else 0, dtype=torch.bool)
-    n = 0
-    for kind in visible.kinds if isinstance(visible, Mixed) else [visible]:
-        discrete[n : n + kind.n] = not kind.real
-        n += kind.n
-    discrete[n:] = True
-    coupled = pairs[~discrete[pairs[:, 0]] & ~discrete[pairs[:, 1]]]
+    n, real = visible.n, _is_real(visible)
+    among = pairs[(pairs < n).all(-1)]
+    coupled = among[real[among].all(-1)]
     allowed = "no couplings between real units, as in an RBM"
     require(not len(coupled), "coupled real units", coupled[:1].flatten().tolist(), allowed)

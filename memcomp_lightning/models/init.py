@@ -107,10 +107,10 @@ def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None
             hides a whole row or column.
     """
     visible = model.visible
+    if observed is not None:
+        check_observed(model, v, observed)
     visible.check(v, observed)
     if visible.real or observed is not None:
-        if observed is not None:
-            check_observed(model, v, observed)
         total, n, variance = _sums(v, observed)
         visible.start(total / n, variance)
     model.b.copy_(independent_bias(v, visible, observed).expand(model.b.shape))
@@ -119,11 +119,14 @@ def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None
 def _sums(v: Tensor, observed: Tensor | None) -> tuple[Tensor, float | Tensor, Tensor]:
     """Of each column its sum, the number of values, and their variance."""
     if observed is None:
-        return v.sum(-2), v.shape[-2], v.var(-2, correction=0)
+        constant = v.amax(-2) == v.amin(-2)  # its variance may be a rounding error
+        return v.sum(-2), v.shape[-2], v.var(-2, correction=0).masked_fill(constant, 0.0)
     known, n = torch.where(observed, v, 0.0), observed.sum(-2).to(v.dtype)
     total = known.sum(-2)
     deviation = torch.where(observed, v - (total / n.clamp(min=1)).unsqueeze(-2), 0.0)
-    return total, n, deviation.square().sum(-2) / n.clamp(min=1)
+    high = torch.where(observed, v, -torch.inf).amax(-2)
+    constant = high == torch.where(observed, v, torch.inf).amin(-2)
+    return total, n, (deviation.square().sum(-2) / n.clamp(min=1)).masked_fill(constant, 0.0)
 
 
 def _empty(shape: tuple[int, ...], generator: Generator) -> Tensor:

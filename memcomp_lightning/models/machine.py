@@ -14,7 +14,7 @@ from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel, Hidden, PerReplica, PerState, Visible
 from memcomp_lightning.models.bit_form import BitForm, bit_form
-from memcomp_lightning.models.units import Bernoulli, Units
+from memcomp_lightning.models.units import Bernoulli, Mixed, Units
 from memcomp_lightning.objective import shares
 from memcomp_lightning.types import Configurations
 
@@ -113,34 +113,25 @@ class Machine(nn.Module):
             value = self.total_energy(v, h, weight)
             moments = self._centred_moments(v, h, weight, visible_offset, hidden_offset)
         surrogate = self._energy_of(moments)
-        curvature = self.visible.curvature
-        if curvature is not None and curvature.requires_grad:
+        layers = (self.visible, self.b, v, visible_offset), (self.hidden, self.c, h, hidden_offset)
+        for units, bias, x, offset in layers:
+            curvature = units.curvature
+            if curvature is None or not curvature.requires_grad:
+                continue
             with torch.no_grad():
-                squares = self._half_squares(v - visible_offset.unsqueeze(-2), weight)
-                at = curvature != 0
-            surrogate = surrogate + vecdot(curvature, squares) + vecdot(self.b, at * visible_offset * squares)
+                centred = x - offset.unsqueeze(-2)
+                squares = 0.5 * (weight.unsqueeze(-2) @ centred.square()).squeeze(-2)
+                along = _learned(units).to(squares.device) * offset * squares
+            surrogate = surrogate + vecdot(curvature, squares) + vecdot(bias, along)
         return value + (surrogate - surrogate.detach())
 
     def _of_measures(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor | float:
-        """Weighted sum of ``-log mu`` over configurations: by moments where a precision multiplies squares."""
+        """Weighted sum of ``-log mu`` over configurations."""
         total: Tensor | float = 0.0
         for units, x in ((self.visible, v), (self.hidden, h)):
-            if units.linear:
-                continue
-            curvature = units.curvature
-            if curvature is None:
-                total = total + (weight * units.energy(x)).sum(-1)
-            else:
-                with torch.no_grad():
-                    squares = self._half_squares(x, weight)
-                total = total + vecdot(curvature, squares)
+            if not units.linear:
+                total = total + units.total_energy(x, weight)
         return total
-
-    @staticmethod
-    def _half_squares(x: Tensor, weight: Tensor) -> Tensor:
-        """Half of the weighted sum of squares of each unit, ``(*replicas, n)``."""
-        squares: Tensor = 0.5 * (weight.unsqueeze(-2) @ x.square()).squeeze(-2)
-        return squares
 
     @abstractmethod
     def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> Sequence[Tensor]:
@@ -155,6 +146,14 @@ class Machine(nn.Module):
     @abstractmethod
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
         """Minus the sum over the parameters of each one times its moment, ``(*replicas,)``."""
+
+
+def _learned(units: Units) -> Tensor:
+    """Which entries have a precision that training changes, ``(n,)``."""
+    if isinstance(units, Mixed):
+        return torch.cat([_learned(kind) for kind in units.kinds])
+    curvature = units.curvature
+    return torch.full((units.n,), curvature is not None and curvature.requires_grad, dtype=torch.bool)
 
 
 def units_of(layer: str, n: int | None, units: Units | None) -> Units:

@@ -13,13 +13,18 @@ Observed = Bool[Tensor, "*replicas n n_visible"]
 
 def check_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
     """Raise a SettingError for a mask of another shape, or one that hides a row, a column or half a site."""
-    require(observed.shape == v.shape, "shape of observed", tuple(observed.shape), f"{tuple(v.shape)}, that of v")
-    require(observed.dtype == torch.bool, "dtype of observed", str(observed.dtype), "torch.bool")
+    check_mask(model, v, observed)
     for axis, name in ((-1, "row"), (-2, "column")):
         hidden = (~observed.any(axis)).nonzero()
         place = hidden[0].tolist()[-1] if len(hidden) else 0
         remedy = f"Leave out the {name}."
         require(not len(hidden), f"observed values in {name} {place}", 0, "one or more", remedy)
+
+
+def check_mask(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
+    """Raise a SettingError for a mask of another shape, or one that hides half a site."""
+    require(observed.shape == v.shape, "shape of observed", tuple(observed.shape), f"{tuple(v.shape)}, that of v")
+    require(observed.dtype == torch.bool, "dtype of observed", str(observed.dtype), "torch.bool")
     known = model.visible.site_sums(observed.to(v.dtype))
     sizes = model.visible.site_sums(torch.ones(model.n_visible, dtype=v.dtype, device=v.device))
     half = ((known != 0) & (known != sizes)).nonzero()
@@ -33,16 +38,13 @@ def visible_field(model: EnergyModel, h: Hidden) -> Visible:
     Raises:
         SettingError: Visible units are coupled to each other.
     """
-    n = model.n_visible
+    n, pairs = model.n_visible, model.quadratic_form().pairs
+    coupled = pairs is not None and bool((pairs < n).all(-1).any())
+    remedy = "Use positive=clamped_gibbs, which draws what is missing."
+    require(not coupled, "couplings between visible units", True, "none where missing values are summed", remedy)
     x = torch.cat((h.new_zeros(*h.shape[:-1], n), h), dim=-1)
     field = torch.empty_like(x)
     for block in model.blocks():
-        seen = block.units < n
-        coupled = bool(seen.any()) and bool((block.neighbours < n).any())
-        remedy = "Use positive=clamped_gibbs, which draws what is missing."
-        require(
-            not coupled, "couplings between visible units", True, "none where missing values are summed", remedy
-        )
         field[..., block.units] = block.field(x)
     return field[..., :n]
 

@@ -1,4 +1,4 @@
-"""What other projects test their own parts with: conformance of samplers and solvers, statistical checks."""
+"""What other projects test their own parts with: conformance of samplers, solvers and units, statistical checks."""
 
 from memcomp_lightning.testing.conformance import (
     check_sampler,
@@ -10,15 +10,21 @@ from memcomp_lightning.testing.conformance import (
     visible_kinds,
 )
 from memcomp_lightning.testing.statistics import chi_square_p_value, state_counts, visible_probabilities
+from memcomp_lightning.testing.units import check_units, small_dbn, small_layers, small_machines, small_rbms
 
 __all__ = [
     "check_sampler",
     "check_solver",
+    "check_units",
     "chi_square_p_value",
     "hidden_kinds",
     "small_dbm",
+    "small_dbn",
+    "small_layers",
     "small_machine",
+    "small_machines",
     "small_rbm",
+    "small_rbms",
     "state_counts",
     "visible_kinds",
     "visible_probabilities",

@@ -55,5 +55,7 @@ def chi_square_p_value(counts: Tensor, probabilities: Tensor, *, min_expected: f
     if bool(rare.any()) and float(expected[rare].sum()) > 0:
         observed_bins = torch.cat((observed_bins, counts[rare].sum().double().reshape(1)))
         expected_bins = torch.cat((expected_bins, expected[rare].sum().reshape(1)))
+    if len(expected_bins) < 2:
+        return 1.0
     expected_bins = expected_bins * observed_bins.sum() / expected_bins.sum()
     return float(stats.chisquare(observed_bins.numpy(), expected_bins.numpy()).pvalue)

@@ -106,6 +106,10 @@ class Units(nn.Module):
 
     # -------------------------------------------------------------------------------------------- measure
 
+    def total_energy(self, x: Values, weight: Float[Tensor, "*axes"]) -> Float[Tensor, "*replicas"]:
+        """Weighted sum of ``energy`` over the rows of x, ``(*replicas, n_rows, n)``, which are constants to autograd."""
+        return (weight * self.energy(x)).sum(-1)
+
     @property
     def curvature(self) -> Tensor | None:
         """Precision of each entry, ``(*replicas, n)``, where mu is ``exp(-curvature x^2 / 2)``, else None."""
@@ -163,8 +167,11 @@ class Units(nn.Module):
         """
 
     @torch.no_grad()
-    def start(self, mean: Values, variance: Values) -> None:
-        """Set the kind's own parameters from means and variances of the data, ``(*replicas, n)``."""
+    def start(self, mean: Values, variance: Values, *, column: int = 0) -> None:
+        """Set the kind's own parameters from means and variances of the data, ``(*replicas, n)``.
+
+        ``column`` is the number of the first entry, for the error.
+        """
 
     def states(self, numbers: Int[Tensor, "*axes"], *, like: Tensor) -> Float[Tensor, "*axes n"]:
         """Values of the whole layer by their numbers, from 0 to ``n_states - 1``, in the dtype of ``like``."""
@@ -182,7 +189,7 @@ class Units(nn.Module):
     # -------------------------------------------------------------------------------------------- entries
 
     def site_of(self) -> Tensor:
-        """The site of each entry, ``(n,)`` int64."""
+        """The site of each entry, ``(n,)`` int64, on the CPU."""
         return torch.arange(self.n)
 
     def over_sites(self, of_sites: Tensor) -> Tensor:

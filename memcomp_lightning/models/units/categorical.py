@@ -49,6 +49,7 @@ class Categorical(Units):
         self._q = widest if all(size == widest for size in sizes) else None
         sites = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes, dtype=torch.long))
         begins = torch.tensor(list(accumulate([0, *sizes[:-1]])) if sizes else [], dtype=torch.long)
+        self._on_the_cpu = sites
         self._site: Tensor
         self._begin: Tensor
         self._slot: Tensor
@@ -194,6 +195,8 @@ class Categorical(Units):
         for size in reversed(self.sizes):
             digits.append(numbers % size)
             numbers = numbers // size
+        if not digits:
+            return like.new_zeros(*numbers.shape, 0)
         return self._one_hot(torch.stack(digits[::-1], dim=-1), like)
 
     @property
@@ -208,7 +211,7 @@ class Categorical(Units):
 
     def site_of(self) -> Tensor:
         """The site of each entry."""
-        return self._site
+        return self._on_the_cpu
 
     def over_sites(self, of_sites: Tensor) -> Tensor:
         """Give each entry what its site has."""

@@ -60,13 +60,14 @@ class Gaussian(Units):
 
     def mean(self, field: Values) -> Values:
         """Field / precision."""
-        return field / self.precision.unsqueeze(-2)
+        return field / self._beside(self.precision, field)
 
+    @torch.no_grad()
     def sample(self, field: Values, *, generator: Generator) -> Values:
         """Draw from N(field / precision, 1 / precision)."""
         noise = torch.empty(field.shape, dtype=field.dtype, device=generator.device)
         noise = noise.normal_(generator=generator).to(field.device)
-        return self.mean(field) + noise * self.precision.rsqrt().unsqueeze(-2)
+        return self.mean(field) + noise * self._beside(self.precision.rsqrt(), field)
 
     def mode(self, field: Values) -> Values:
         """The mean."""
@@ -74,12 +75,12 @@ class Gaussian(Units):
 
     def cumulant(self, field: Values) -> PerSite:
         """f^2 / (2 precision) + log(2 pi / precision) / 2."""
-        precision = self.precision.to(field.dtype).unsqueeze(-2)
+        precision = self._beside(self.precision.to(field.dtype), field)
         return field.square() / (2 * precision) + 0.5 * torch.log(2 * math.pi / precision)
 
     def points(self, field: Values) -> list[Values]:
         """Mean plus and mean less a standard deviation: their first and second moments are the exact ones."""
-        mean, deviation = self.mean(field), self.precision.rsqrt().unsqueeze(-2)
+        mean, deviation = self.mean(field), self._beside(self.precision.rsqrt(), field)
         return [mean + deviation, mean - deviation]
 
     @property
@@ -89,7 +90,19 @@ class Gaussian(Units):
 
     def energy(self, x: Values) -> Tensor:
         """Half of precision x^2, summed."""
-        return 0.5 * (x.square() * self.precision.unsqueeze(-2)).sum(-1)
+        return 0.5 * (x.square() * self._beside(self.precision, x)).sum(-1)
+
+    def total_energy(self, x: Values, weight: Tensor) -> Tensor:
+        """By the sums of squares, so that its backward pass is one of a vector."""
+        with torch.no_grad():
+            squares = 0.5 * (weight.unsqueeze(-2) @ x.square()).squeeze(-2)
+        total: Tensor = torch.linalg.vecdot(self.precision, squares)
+        return total
+
+    @staticmethod
+    def _beside(own: Tensor, x: Tensor) -> Tensor:
+        """A parameter ``(*replicas, n)`` with an axis for each of x between the replicas and the units."""
+        return own.reshape(*own.shape[:-1], *[1] * (x.ndim - own.ndim), own.shape[-1])
 
     @torch.no_grad()
     def project(self) -> None:
@@ -116,7 +129,7 @@ class Gaussian(Units):
         return total / n * self.precision
 
     @torch.no_grad()
-    def start(self, mean: Values, variance: Values) -> None:
+    def start(self, mean: Values, variance: Values, *, column: int = 0) -> None:
         """Take the precisions of the data, if they are learned.
 
         Raises:
@@ -127,7 +140,7 @@ class Gaussian(Units):
         usable = (variance > 0) & variance.isfinite()
         if not bool(usable.all()):
             place = (~usable).nonzero()[0].tolist()
-            _refuse_variance(float(variance[tuple(place)]), place[-1])
+            _refuse_variance(float(variance[tuple(place)]), column + place[-1])
         self.precision.copy_((1 / variance).expand_as(self.precision))
         self.first_precision.copy_(self.precision)
 

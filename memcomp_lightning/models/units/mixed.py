@@ -116,6 +116,11 @@ class Mixed(Units):
         energies = [kind.energy(part) for kind, part in zip(self.kinds, self._split(x), strict=True)]
         return torch.stack(energies).sum(0)
 
+    def total_energy(self, x: Values, weight: Tensor) -> Tensor:
+        """The sum of the parts'."""
+        totals = [kind.total_energy(part, weight) for kind, part in zip(self.kinds, self._split(x), strict=True)]
+        return torch.stack(totals).sum(0)
+
     def project(self) -> None:
         """Each part."""
         for kind in self.kinds:
@@ -144,10 +149,11 @@ class Mixed(Units):
         parts = zip(self.kinds, self._split(total), counts, strict=True)
         return torch.cat([kind.bias_of(part, count) for kind, part, count in parts], dim=-1)
 
-    def start(self, mean: Values, variance: Values) -> None:
+    def start(self, mean: Values, variance: Values, *, column: int = 0) -> None:
         """Each part."""
         for kind, *parts in zip(self.kinds, self._split(mean), self._split(variance), strict=True):
-            kind.start(*parts)
+            kind.start(*parts, column=column)
+            column += kind.n
 
     def states(self, numbers: Tensor, *, like: Tensor) -> Tensor:
         """Those of all parts, the first part counting slowest."""

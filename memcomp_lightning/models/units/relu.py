@@ -9,6 +9,12 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.models.units.base import PerSite, Units, Values, require_values
 
+_FAR = 40.0
+"""In float64 the mean is a sum of powers of 1 / f below minus this field."""
+
+_NEWTON_STEPS = 30
+"""They come from above, where the steps are safe, and are many more than double precision needs."""
+
 _TAIL = -30.0
 """Below this field a truncated normal is drawn by its Rayleigh tail, which is then exact to a thousandth."""
 
@@ -31,13 +37,22 @@ class ReLU(Units):
 
     def mean(self, field: Values) -> Values:
         """F + phi(f) / Phi(f), without cancellation where f is far below zero."""
-        far = field < -8.0
-        inverse = torch.where(far, field, -8.0).reciprocal().square()
+        far = _is_far(field)
+        below = torch.where(far, field, -_FAR)
+        inverse = below.reciprocal().square()
         tail = 1 - inverse * (2 - inverse * (10 - inverse * (74 - inverse * 706)))
         near = torch.where(far, 0.0, field)
-        ratio = math.sqrt(2 / math.pi) / torch.special.erfcx(-near.clamp(max=8.0) / math.sqrt(2))
-        ratio = torch.where(near > 8.0, 0.0, ratio)
-        return torch.where(far, -tail / torch.where(far, field, -8.0), near + ratio)
+        return torch.where(far, -tail / below, near + _hazard(near))
+
+    def points(self, field: Values) -> list[Values]:
+        """Mean plus and mean less a standard deviation, which is at most the mean."""
+        far, mean = _is_far(field), self.mean(field)
+        below = torch.where(far, field, -_FAR)
+        inverse = below.reciprocal().square()
+        tail = inverse * (1 - inverse * (6 - inverse * (50 - inverse * (518 - inverse * 6354))))
+        near = torch.where(far, 0.0, field)
+        deviation = torch.where(far, tail, 1 - _hazard(near) * torch.where(far, 1.0, mean)).clamp(min=0.0).sqrt()
+        return [mean + deviation, (mean - deviation).clamp(min=0.0)]
 
     def sample(self, field: Values, *, generator: Generator) -> Values:
         """Draw by inversion, in float64."""
@@ -45,7 +60,8 @@ class ReLU(Units):
         u = 1 - rng.uniform(f.shape, generator=generator, like=f)  # in (0, 1]
         near = f.clamp(min=_TAIL)
         # The part of the distribution above zero, seen from its upper end: never 1 - p for a small p.
-        found = near - torch.special.ndtri(u * torch.special.ndtr(near))
+        # (torch.special.ndtr is zero below -8.3.)
+        found = near - torch.special.ndtri(u * 0.5 * torch.special.erfc(-near / math.sqrt(2)))
         tail = (f.square() - 2 * u.log()).sqrt() + f
         return torch.where(f < _TAIL, tail, found).clamp(min=0.0).to(field.dtype)
 
@@ -69,5 +85,21 @@ class ReLU(Units):
         require_values(v, (v >= 0) & v.isfinite(), observed, column, "finite values >= 0 for ReLU units")
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
-        """The mean, which is the field where it is above one."""
-        return total / n
+        """By Newton's method: the mean is a convex function of the field. A mean of zero counts as a hundredth."""
+        mean = (total / n).double().clamp(min=0.01)
+        field = mean - 1 / mean
+        for _ in range(_NEWTON_STEPS):
+            value = self.mean(field)
+            field = field - (value - mean) / (1 - (value - field) * value).clamp(min=1e-6)
+        return field.to(total.dtype)
+
+
+def _is_far(field: Tensor) -> Tensor:
+    """Where sums for fields far below zero have more right digits than differences."""
+    return field < (-_FAR if field.dtype == torch.float64 else -8.0)
+
+
+def _hazard(field: Tensor) -> Tensor:
+    """phi(f) / Phi(f), the normal density over its distribution; zero where it is below rounding."""
+    ratio = math.sqrt(2 / math.pi) / torch.special.erfcx(-field.clamp(max=8.5) / math.sqrt(2))
+    return torch.where(field > 8.5, 0.0, ratio)
