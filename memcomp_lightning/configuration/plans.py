@@ -32,7 +32,7 @@ from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
 from memcomp_lightning.studies.plan import Plan, Stage
-from memcomp_lightning.training import OptimizerFactory, Schedule
+from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule
 from memcomp_lightning.training.schedules import check_schedules
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
@@ -41,7 +41,7 @@ _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed"
 _SETTINGS = {
     "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
-    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "stage"),
+    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "penalties", "stage"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best"),
     "callbacks": ("pretrain", "finetune"),
 }
@@ -94,6 +94,7 @@ def build(config: DictConfig) -> Plan:
             optimizer=_optimizer(config, "pretrain", schedules),
             schedules=schedules,
             centring=centring,
+            penalties=_penalties(config),
             seed=seed,
         )
         pretraining = Stage(module, data, callbacks)
@@ -174,6 +175,18 @@ def _units(settings: DictConfig, name: str, n_sites: int) -> Units:
         raise UserError(f"{name}: {in_words(error)}") from error
     require(isinstance(units, Units), name, type(units).__name__, "a kind of memcomp_lightning.models.units")
     return cast(Units, units)
+
+
+def _penalties(config: DictConfig) -> list[Penalty]:
+    """What the couplings cost in pretraining."""
+    found = []
+    for name, settings in (config.pretrain.get("penalties") or {}).items():
+        penalty = _part(settings, f"pretrain.penalties.{name}")
+        if penalty is not None:
+            allowed = "a penalty, which is called with a model: memcomp_lightning.training.L1, L2, GroupSparsity"
+            require(callable(penalty), f"pretrain.penalties.{name}", type(penalty).__name__, allowed)
+            found.append(penalty)
+    return found
 
 
 def _network(config: DictConfig, images: ImageData, units: Units) -> nn.Module:

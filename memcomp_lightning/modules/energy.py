@@ -26,6 +26,7 @@ from memcomp_lightning.training import (
     PRETRAINING_SGD,
     EnergyStep,
     OptimizerFactory,
+    Penalty,
     Phase,
     PretrainingStage,
     Processes,
@@ -53,6 +54,7 @@ class EnergyPretraining(StageModule):
         optimizer: Builds the optimiser of one model from its parameters.
         schedules: Change the optimiser from pass to pass, for each model anew.
         centring: Settings of the centred gradient; None follows the plain one.
+        penalties: What the couplings cost, beside the contrast: ``[L1(1e-3)]``.
         seed: Seed of the random streams.
 
     Attributes:
@@ -72,6 +74,7 @@ class EnergyPretraining(StageModule):
         optimizer: OptimizerFactory = PRETRAINING_SGD,
         schedules: Sequence[Schedule] = (),
         centring: Centring | None = CENTRED,
+        penalties: Sequence[Penalty] = (),
         seed: int = 0,
     ) -> None:
         require_count("pretrain.iterations", iterations)
@@ -84,6 +87,7 @@ class EnergyPretraining(StageModule):
         self.models_beside_network = nn.ModuleList(m for m in cast(list[nn.Module], self.models) if m not in known)
         self.sampler = sampler
         self.centring = centring
+        self.penalties = penalties
         self.energy_gaps: list[Tensor] = []
         self._state = StepState()
         self._gap: Tensor | float = 0.0
@@ -234,10 +238,12 @@ class EnergyPretraining(StageModule):
             v, (positive, inferred) = self.phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
         processes = _OfTrainer(self.trainer, self.device) if self.trainer.world_size > 1 else Processes()
-        step = EnergyStep(sampler=self.sampler, centring=self.centring, processes=processes)
+        step = EnergyStep(
+            sampler=self.sampler, centring=self.centring, penalties=self.penalties, processes=processes
+        )
         generator = self.streams["negative_phase"]
         gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
-        loss = batch.share * gap.sum()
+        loss = step.loss(self.model, gap, batch.share)
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
         gap_so_far = self._gap + batch.share * gap.detach()
         self._gap = gap_so_far

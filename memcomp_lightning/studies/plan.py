@@ -44,6 +44,7 @@ def passes_without_trainer(
         optimizer=module.make_optimizer,
         schedules=module.schedules,
         centring=module.centring,
+        penalties=module.penalties,
         seed=seed,
     )
 

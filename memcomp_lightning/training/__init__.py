@@ -5,6 +5,7 @@ from memcomp_lightning.training.best import BestPass
 from memcomp_lightning.training.diverged import DivergedError, diverged_parameter, require_finite
 from memcomp_lightning.training.loops import Batches, ClassifierTraining, Pass, PhaseTraining, finetune, pretrain
 from memcomp_lightning.training.losses import LOSSES, Loss, cross_entropy, squared_error
+from memcomp_lightning.training.penalties import L1, L2, GroupSparsity, Penalty
 from memcomp_lightning.training.schedules import (
     FINETUNING_SGD,
     PRETRAINING_SGD,
@@ -19,6 +20,8 @@ from memcomp_lightning.training.step import EnergyStep, Processes, Sampler, Step
 
 __all__ = [
     "FINETUNING_SGD",
+    "L1",
+    "L2",
     "LOSSES",
     "PRETRAINING_SGD",
     "Batches",
@@ -29,12 +32,14 @@ __all__ = [
     "DivergedError",
     "EnergyStep",
     "Greedy",
+    "GroupSparsity",
     "Joint",
     "LearningRateDecay",
     "Loss",
     "MomentumSchedule",
     "OptimizerFactory",
     "Pass",
+    "Penalty",
     "Phase",
     "PhaseTraining",
     "PretrainingStage",

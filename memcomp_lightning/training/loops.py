@@ -20,6 +20,7 @@ from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import BestPass
 from memcomp_lightning.training.diverged import require_finite
 from memcomp_lightning.training.losses import Loss, cross_entropy
+from memcomp_lightning.training.penalties import Penalty
 from memcomp_lightning.training.schedules import OptimizerFactory, Schedule, begin_pass
 from memcomp_lightning.training.score import evaluate
 from memcomp_lightning.training.stages import Phase, PretrainingStage
@@ -60,6 +61,7 @@ def pretrain(
     optimizer: OptimizerFactory,
     schedules: Sequence[Schedule] = (),
     centring: Centring | None = None,
+    penalties: Sequence[Penalty] = (),
     seed: int = 0,
 ) -> Iterator[Pass]:
     """Train the models of a stage one after the other, in place; yield each pass once it is done.
@@ -72,6 +74,7 @@ def pretrain(
         optimizer: Builds the optimiser of one model, element-wise, so that replicas stay independent.
         schedules: Change the optimiser from pass to pass, for each model anew.
         centring: Settings of the centred gradient; None follows the plain one.
+        penalties: What the couplings cost, beside the contrast.
         seed: Of the random streams.
 
     Raises:
@@ -84,7 +87,13 @@ def pretrain(
     for number, phase in enumerate(stage.phases):
         model = cast(nn.Module, phase.model).to(device)  # it need not be a part of the network
         training = PhaseTraining(
-            phase, sampler, optimizer=optimizer, schedules=schedules, centring=centring, streams=streams
+            phase,
+            sampler,
+            optimizer=optimizer,
+            schedules=schedules,
+            centring=centring,
+            penalties=penalties,
+            streams=streams,
         )
         for epoch in range(number * iterations, (number + 1) * iterations):
             batches.set_epoch(epoch)
@@ -101,7 +110,7 @@ class PhaseTraining:
 
     Args:
         phase: The energy model, trained in place, and what it sees.
-        sampler, optimizer, schedules, centring: As for :func:`pretrain`.
+        sampler, optimizer, schedules, centring, penalties: As for :func:`pretrain`.
         streams: Generators by the names "negative_phase" and "positive_phase".
     """
 
@@ -113,10 +122,11 @@ class PhaseTraining:
         optimizer: OptimizerFactory,
         schedules: Sequence[Schedule] = (),
         centring: Centring | None,
+        penalties: Sequence[Penalty] = (),
         streams: Mapping[str, Generator],
     ) -> None:
         self.phase = phase
-        self.step = EnergyStep(sampler=sampler, centring=centring)
+        self.step = EnergyStep(sampler=sampler, centring=centring, penalties=penalties)
         self.schedules = schedules
         self.streams = streams
         self.optimizer = optimizer(phase.model.parameters())
@@ -127,7 +137,7 @@ class PhaseTraining:
         """Take other settings for the passes that follow; another sampler starts anew."""
         if sampler != self.step.sampler:
             self._state = self._state._replace(sampler=None)
-        self.step = EnergyStep(sampler=sampler, centring=centring)
+        self.step = EnergyStep(sampler=sampler, centring=centring, penalties=self.step.penalties)
 
     @with_gradient()
     def run_pass(self, batches: Iterable[Batch]) -> Pass:
@@ -141,7 +151,7 @@ class PhaseTraining:
             gap, _, state = self.step.contrast(
                 phase.model, positive, state, generator=self.streams["negative_phase"]
             )
-            (batch.share * gap.sum()).backward()
+            self.step.loss(phase.model, gap, batch.share).backward()
             if batch.closes_step:
                 self.optimizer.step()
                 phase.model.project()

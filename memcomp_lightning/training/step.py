@@ -1,6 +1,6 @@
 """One update of an energy model: what Lightning's loop and the bare loop on the replica axis have in common."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.objective import Centring, Offsets, contrast
 from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
+from memcomp_lightning.training.penalties import Penalty, with_penalties
 from memcomp_lightning.types import Configurations, NegativePhase
 
 Sampler: TypeAlias = NegativePhaseSampler[Any, Any]
@@ -55,11 +56,13 @@ class EnergyStep:
     Attributes:
         sampler: Supplies the negative phase.
         centring: Settings of the centred gradient; None follows the plain one.
+        penalties: What the couplings cost beside the contrast.
         processes: Those that share the update.
     """
 
     sampler: Sampler
     centring: Centring | None = None
+    penalties: Sequence[Penalty] = ()
     processes: Processes = field(default_factory=Processes)
 
     def __post_init__(self) -> None:
@@ -83,6 +86,19 @@ class EnergyStep:
             negative = self._negative_phase(model, positive, state.sampler, generator)
         gap = contrast(model, positive, negative.configurations, offsets)
         return gap, negative, StepState(negative.state, offsets, negative)
+
+    def loss(self, model: EnergyModel, gap: Tensor, share: float) -> Tensor:
+        """Return what a batch adds to the loss of the update, whose gradient is followed, a scalar.
+
+        Shares of the batches of an update add up to one, so that the penalties count once, whatever the number of
+        batches and processes.
+
+        Args:
+            model: The energy model.
+            gap: Its contrast on the batch, ``(*replicas,)``.
+            share: Of the batch, see :class:`memcomp_lightning.types.Batch`.
+        """
+        return share * with_penalties(gap, model, self.penalties).sum()
 
     def _negative_phase(
         self, model: EnergyModel, positive: Configurations, state: object, generator: Generator

@@ -38,10 +38,15 @@ def schedule(name: str, stage: str) -> str:
 
 
 SCHEDULES = [schedule(name, stage) for name in ("momentum", "decay") for stage in ("pretrain", "finetune")]
+PENALTIES = [
+    f"pretrain.penalties.{name}={{_target_:memcomp_lightning.training.{kind},strength:0.01}}"
+    for name, kind in (("l1", "L1"), ("l2", "L2"), ("groups", "GroupSparsity"))
+]
 CASES = [
     *([f"sampler={sampler}", *SCHEDULES] for sampler in options("sampler") if sampler not in NOT_HERE),
     *([f"control={control}"] for control in options("control")),
     ["sampler=pcd", "pretrain=greedy", SCHEDULES[0]],
+    ["sampler=pseudo_likelihood", "pretrain=joint", "data.partitions=2", "data.chunk_size=3", *PENALTIES],
     ["sampler=mode_assisted_pcd", "pretrain=joint", *SCHEDULES],
     ["control=bn_relu", "finetune.keep_best=true", "data.validation_fraction=0.2", SCHEDULES[3]],
     ["sampler=cd", "finetune.loss=squared_error", "finetune.units=batch_norm_relu", "data.partitions=2"],
