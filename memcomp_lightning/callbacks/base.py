@@ -15,6 +15,7 @@ Optional attributes:
 * ``active_optimizer``: the optimiser that steps now; default the trainer's first.
 """
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Protocol, TypedDict, cast
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 
+log = logging.getLogger(__name__)
+
+
 class StepOutputs(TypedDict, total=False):
     """What a step returns.
 
@@ -45,6 +49,7 @@ class StepOutputs(TypedDict, total=False):
         info: Diagnostics of the sampler; of ``training_step``, may be left out.
         v: Visible states of held-out images, of ``validation_step``; of ``training_step`` those of its images, if
             ``positive.v`` is something else.
+        observed: Where ``v`` is known, a mask of its shape; None, or left out, is everywhere.
         score: Of a classifier; of all steps.
     """
 
@@ -53,6 +58,7 @@ class StepOutputs(TypedDict, total=False):
     contrast: Tensor
     info: dict[str, Tensor]
     v: Tensor
+    observed: Tensor | None
     score: Score
 
 
@@ -148,17 +154,24 @@ class LastImages:
     def __init__(self, n: int) -> None:
         require_count("n_images", n)
         self.n = n
-        self._batches: list[Tensor] = []
+        self._batches: list[tuple[Tensor, Tensor | None]] = []
 
-    def add(self, v: Tensor) -> None:
-        """Keep references to the images ``(*replicas, n, n_visible)`` of a batch."""
-        self._batches.append(v[..., : self.n, :])
-        while sum(kept.shape[-2] for kept in self._batches[1:]) >= self.n:
+    def add(self, v: Tensor, observed: Tensor | None = None) -> None:
+        """Keep references to the images ``(*replicas, n, n_visible)`` of a batch, and to their mask."""
+        self._batches.append((v[..., : self.n, :], None if observed is None else observed[..., : self.n, :]))
+        while sum(kept.shape[-2] for kept, _ in self._batches[1:]) >= self.n:
             self._batches.pop(0)
 
     def images(self) -> Tensor | None:
         """The kept images, ``(*replicas, n, n_visible)``; None before the first batch."""
-        return torch.cat(self._batches, dim=-2) if self._batches else None
+        return torch.cat([v for v, _ in self._batches], dim=-2) if self._batches else None
+
+    def observed(self) -> Tensor | None:
+        """Where they are known; None is everywhere."""
+        if all(mask is None for _, mask in self._batches):
+            return None
+        masks = [torch.ones_like(v, dtype=torch.bool) if mask is None else mask for v, mask in self._batches]
+        return torch.cat(masks, dim=-2)
 
 
 class EveryIterations(pl.Callback, ABC):
@@ -173,6 +186,13 @@ class EveryIterations(pl.Callback, ABC):
         require_count("every", every)
         self.every = every
         self._outputs: object = None
+        self._said: set[str] = set()
+
+    def leave_out(self, why: str) -> None:
+        """Say once why there is nothing to see."""
+        if why not in self._said:
+            self._said.add(why)
+            log.info("%s is left out: %s", type(self).__name__, why)
 
     def is_due(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> bool:
         """Whether the present pass is looked at."""
@@ -203,6 +223,11 @@ def images_of_step(outputs: object, callback: pl.Callback) -> Tensor:
     if isinstance(outputs, Mapping) and "v" in outputs:
         return required(outputs, callback, "v")["v"]
     return required(outputs, callback, "positive")["positive"].v
+
+
+def mask_of_step(outputs: object) -> Tensor | None:
+    """Where the images of a step are known; None is everywhere."""
+    return cast(StepOutputs, outputs).get("observed") if isinstance(outputs, Mapping) else None
 
 
 def required(outputs: object, callback: pl.Callback, *keys: str) -> StepOutputs:

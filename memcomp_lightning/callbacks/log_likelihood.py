@@ -14,12 +14,15 @@ from memcomp_lightning.callbacks.base import (
     images_of_step,
     iteration_of,
     log_scalars,
+    mask_of_step,
     model_of,
     require_enumerable,
     required,
 )
 from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.models.machine import log2_states
 
 QUICKLY_ENUMERATED = 16
 """Units that "auto" enumerates at most."""
@@ -53,9 +56,11 @@ class LogLikelihood(EveryIterations):
     Training images are those of the pass's last batches, about ``n_images`` of them; held-out images are those of
     a validation at the end of the pass, if there is one. Images that are not 0 or 1 have no likelihood under a
     Bernoulli model: each intensity is taken as the probability of a 1 and drawn, with a random stream of the
-    callback's own, the same draws each time. In upper layers of a stack the "images" are mean activations, drawn
-    likewise, and the likelihood is that of the layer. For a Boltzmann machine with more than 16 hidden units the
-    mean-field bound takes the place of the likelihood.
+    callback's own, the same draws each time; so are means of spins and of categories. Of real units it is the log
+    of a density. Where values are missing it is that of the observed ones, of models with up to 16 hidden units;
+    of larger ones there is none. In upper layers of a stack the "images" are mean activations, drawn likewise, and
+    the likelihood is that of the layer. For a Boltzmann machine with more than 16 hidden units the mean-field
+    bound takes the place of the likelihood.
 
     Annealed importance sampling (AIS; Salakhutdinov & Murray 2008) starts at independent units with the means of
     the training images. Its estimate of log Z tends to be too small, and the likelihood too large;
@@ -124,7 +129,7 @@ class LogLikelihood(EveryIterations):
         """Keep the visible states of the last batches."""
         super().on_train_batch_end(trainer, pl_module, outputs)
         if self._looks(trainer, pl_module):
-            self._train.add(images_of_step(outputs, self))
+            self._train.add(images_of_step(outputs, self), mask_of_step(outputs))
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start a new sum, and the draws of the same bits as before."""
@@ -138,8 +143,9 @@ class LogLikelihood(EveryIterations):
     ) -> None:
         """Unnormalised log-likelihood of one chunk of held-out images."""
         if self._looks(trainer, pl_module) and not trainer.sanity_checking and self._bits is not None:
-            v = required(outputs, self, "v")["v"]
-            self._heldout.append((self._total(model_of(pl_module), v, self._bits), v.shape[-2]))
+            v, observed = required(outputs, self, "v")["v"], mask_of_step(outputs)
+            if sums_missing(model_of(pl_module), observed):
+                self._heldout.append((self._total(model_of(pl_module), v, observed, self._bits), v.shape[-2]))
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Normalise."""
@@ -147,11 +153,16 @@ class LogLikelihood(EveryIterations):
         method = self._method_for(model)
         if method is None:
             return
-        train = self._train.images()
-        values = self._partition_function(model, method, train)
+        train, observed = self._train.images(), self._train.observed()
+        if not sums_missing(model, observed):
+            self.leave_out(
+                "missing values are summed for models of up to 16 hidden units, coupled to visible ones"
+            )
+            return
+        values = self._partition_function(model, method, train, observed)
         log_z = values["log_z"]
         if train is not None:
-            total = self._total(model, train, rng.stream(self.seed, "log_likelihood", 0))
+            total = self._total(model, train, observed, rng.stream(self.seed, "log_likelihood", 0))
             values["log_likelihood_train"] = total / train.shape[-2] - log_z
         # A validation in the middle of the pass has judged another model.
         judged = bool(self._heldout) and self._judged_at == trainer.global_step
@@ -191,12 +202,14 @@ class LogLikelihood(EveryIterations):
         n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
         return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
 
-    def _partition_function(self, model: EnergyModel, method: str, train: Tensor | None) -> dict[str, Tensor]:
+    def _partition_function(
+        self, model: EnergyModel, method: str, train: Tensor | None, observed: Tensor | None
+    ) -> dict[str, Tensor]:
         """``log_z`` and, where it is an estimate, how good it is."""
         if method == "exact":
             return {"log_z": likelihood.log_partition_function(model, max_units=self.max_units)}
         ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
-        base = None if train is None else likelihood.base_of(train)
+        base = None if train is None else likelihood.base_of(train, model.visible, observed)
         estimate = ais.estimate(model, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
         return {
             "log_z": estimate.log_z,
@@ -205,8 +218,19 @@ class LogLikelihood(EveryIterations):
         }
 
     @staticmethod
-    def _total(model: EnergyModel, v: Tensor, bits: Generator) -> Tensor:
-        """Sum over binarised images of log p(v) + log Z, ``(*replicas,)`` float64."""
+    def _total(model: EnergyModel, v: Tensor, observed: Tensor | None, bits: Generator) -> Tensor:
+        """Sum over images of values of the units of log p(v) + log Z, ``(*replicas,)`` float64."""
         log_z = v.new_zeros(model.replicas, dtype=torch.float64)
-        v = rng.bernoulli(v, generator=bits)
+        v = model.visible.values_of(v, generator=bits)
+        if observed is not None:
+            return likelihood.log_likelihood(model, v, log_z, observed=observed).sum(-1)
         return likelihood.log_likelihood_or_bound(model, v, log_z).double().sum(-1)
+
+
+def sums_missing(model: EnergyModel, observed: Tensor | None) -> bool:
+    """Whether the likelihood of data with this mask can be computed."""
+    if observed is None:
+        return True
+    pairs, n = model.quadratic_form().pairs, model.n_visible
+    coupled = pairs is not None and bool((pairs < n).all(-1).any())
+    return not coupled and not model.hidden.real and log2_states(model.hidden) <= MOST_HIDDEN

@@ -7,7 +7,7 @@ import lightning.pytorch as pl
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import EveryIterations, tensorboards, write_picture
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import SettingError, require_count
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.training.stages.base import unchanged
 
@@ -19,6 +19,7 @@ class Pictures(EveryIterations):
     """Writes one picture grid of the first replica every so many passes.
 
     The data module's ``pixel_layout`` says by ``to_picture`` where each input lies; without one nothing is drawn.
+    Its ``units``, if it has some, turn values into grey ones: spins, and the mean level of categories.
 
     Args:
         tag: Name of the picture, after stage and layer.
@@ -41,10 +42,16 @@ class Pictures(EveryIterations):
         layout: PixelLayout | None = getattr(getattr(trainer, "datamodule", None), "pixel_layout", None)
         if layout is None or not tensorboards(trainer):
             return
-        tiles = self.tiles(pl_module, outputs)
+        tiles, units = self.tiles(pl_module, outputs), getattr(trainer.datamodule, "units", None)  # type: ignore[attr-defined]
         if not tiles.numel():  # receptive fields of no hidden units
             return
         first_replica = tiles.reshape(-1, *tiles.shape[-2:])[0, : self.n_pictures]
+        if units is not None:
+            try:
+                first_replica = units.to_intensity(first_replica)
+            except SettingError as error:
+                self.leave_out(str(error))
+                return
         grid = picture_grid(layout.to_picture(first_replica).float().cpu().numpy())
         write_picture(trainer, pl_module, self.tag, grid)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, prefix_of, required
 from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.units import Bernoulli, Units
 from memcomp_lightning.types import Configurations
 
 
@@ -17,7 +18,8 @@ class SamplerDiagnostics(EveryIterations):
 
     For chains that persist from update to update there are two keys more:
 
-    * ``bits_changed``: mean of ``|v - v at the last look|`` over units and chains, the share of bits that changed.
+    * ``bits_changed``: mean of ``|v - v at the last look|`` over units and chains, the share of bits that changed;
+      of spins and categories ``sites_changed``, the share of sites, and of real units neither.
     * ``autocorrelation_time``: of the chains' energies from look to look, integrated, in passes; see
       :func:`autocorrelation_time`. It needs at least two looks and two chains. A value above a tenth of the
       passes that ``history`` spans means "at least so much".
@@ -55,7 +57,7 @@ class SamplerDiagnostics(EveryIterations):
         values = {}
         v = negative.v.detach().clone().cpu()  # a sampler of somebody else's may go on in the same tensor
         if self._v is not None:
-            values["bits_changed"] = (v - self._v).abs().mean((-1, -2))
+            values |= _changed(model_of(module).visible, v, self._v)
         energy = model_of(module).energy(negative.v, negative.h).cpu()
         self._v, self._energies = v, [*self._energies, energy][-self.history :]
         if len(self._energies) >= 2 and energy.shape[-1] >= 2:
@@ -70,6 +72,18 @@ class SamplerDiagnostics(EveryIterations):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         self._stage, self._energies, self._v = state_dict["stage"], state_dict["energies"], state_dict["v"]
+
+
+def _changed(units: Units, v: Tensor, before: Tensor) -> dict[str, Tensor]:
+    """The share of units that are not what they were, by its name."""
+    change = (v - before).abs()
+    if isinstance(units, Bernoulli):
+        return {"bits_changed": change.mean((-1, -2))}
+    if units.real:
+        return {}
+    site, shape = units.site_of().to(v.device), (*v.shape[:-1], units.n_sites)
+    of_sites = v.new_zeros(shape).index_add_(-1, site, change)
+    return {"sites_changed": (of_sites > 0).to(v.dtype).mean((-1, -2))}
 
 
 def autocorrelation_time(series: Tensor) -> Tensor:

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from memcomp_lightning.callbacks.base import iteration_of, prefix_of
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.units import Spin
 from memcomp_lightning.modules.weights import write_tensors
 from memcomp_lightning.training import DivergedError, diverged_parameter
+from memcomp_lightning.types import Configurations
 
 log = logging.getLogger(__name__)
 
@@ -27,10 +29,10 @@ class SaturationGuard(pl.Callback):
 
     Looks after the last update of each pass, before validation and checkpoints, so that no bad checkpoint is
     written. Hidden units are stuck if 99 % of their means given the images of that batch (``positive.h``) are
-    within 1e-6 of 0 or 1, in any replica, for ``patience`` passes in a row; modules that train no energy model are
-    judged by their parameters alone. The weights of the last good pass are then written to ``last_good.pt``, in
-    the folder of the checkpoint callback, else in the trainer's ``default_root_dir``:
-    ``module.load_state_dict(torch.load(path))`` brings them back.
+    within 1e-6 of one of their two values, in any replica, for ``patience`` passes in a row; modules that train no
+    energy model, and hidden units that are real, are judged by their parameters alone. The weights of the last
+    good pass are then written to ``last_good.pt``, in the folder of the checkpoint callback, else in the trainer's
+    ``default_root_dir``: ``module.load_state_dict(torch.load(path))`` brings them back.
 
     :class:`memcomp_lightning.modules.StageModule` has a check of its own, always on, for entries beyond 1e15 or
     not finite: it protects the checkpoints of our modules and keeps no weights. Where it stops training first,
@@ -74,11 +76,11 @@ class SaturationGuard(pl.Callback):
                 f"{where}: {diverged}, allowed is at most largest = {self.largest:g}. {self._save(trainer)} Go on "
                 "from there with a lower learning rate, or raise SaturationGuard's largest."
             )
-        stuck = self._stuck(trainer, outputs)
+        stuck = self._stuck(trainer, pl_module, outputs)
         self._n_stuck = self._n_stuck + 1 if stuck >= NEARLY_ALL else 0
         if self._n_stuck >= self.patience:
             raise DivergedError(
-                f"{where}: {stuck:.1%} of the hidden means given the data are within {AT_AN_END:g} of 0 or 1, for "
+                f"{where}: {stuck:.1%} of the hidden means given the data are within {AT_AN_END:g} of an end, for "
                 f"patience = {self.patience} passes. {self._save(trainer)} Go on from there with a lower learning "
                 "rate or with weight decay, or raise SaturationGuard's patience."
             )
@@ -91,12 +93,14 @@ class SaturationGuard(pl.Callback):
             log.warning(self._save(trainer))
 
     @staticmethod
-    def _stuck(trainer: pl.Trainer, outputs: object) -> float:
+    def _stuck(trainer: pl.Trainer, module: pl.LightningModule, outputs: object) -> float:
         """Share of saturated hidden means in the worst replica, the same in every process."""
         positive = outputs.get("positive") if isinstance(outputs, dict) else None
-        if positive is None or not positive.h.numel():
+        kind = getattr(getattr(module, "model", None), "hidden", None)
+        if positive is None or not positive.h.numel() or getattr(kind, "real", False):
             return 0.0
-        h = positive.h
+        h = _means(positive, outputs.get("v") if isinstance(outputs, dict) else None)
+        h = kind.to_intensity(h) if isinstance(kind, Spin) else h
         share = (torch.minimum(h, 1 - h) <= AT_AN_END).float().mean((-1, -2)).max()
         return float(trainer.strategy.reduce(share, reduce_op="mean"))
 
@@ -124,3 +128,12 @@ class SaturationGuard(pl.Callback):
         """Inverse of :meth:`state_dict`; in a good pass the module's own weights are the last good ones."""
         self._n_stuck = state_dict["n_stuck"]
         self._good, self._good_at = state_dict["good"], state_dict["good_at"]
+
+
+def _means(positive: Configurations, v: Tensor | None) -> Tensor:
+    """Hidden means of each image, of which the positive phase may hold all hidden states with their weights."""
+    h, weight = positive.h, positive.weight
+    if v is None or weight is None or h.shape[-2] == v.shape[-2]:
+        return h
+    weight = weight.unflatten(-1, (v.shape[-2], -1)).unsqueeze(-1)
+    return (h.unflatten(-2, (v.shape[-2], -1)) * weight).sum(-2) / weight.sum(-2)

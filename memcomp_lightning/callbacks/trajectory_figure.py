@@ -18,7 +18,9 @@ class TrajectoryFigure(EveryIterations):
 
     The picture is that of Manukian et al. 2019, Fig. 2, by :func:`memcomp_lightning.plotting.plot_trajectory`. The
     machine has a random stream of its own and the same start each time, so that pictures compare, and runs on the
-    CPU; training does not see it. A large model costs seconds a picture; without TensorBoard nothing is solved.
+    CPU; training does not see it. Spins are written in bits, real units are integrated out; of categories, whose
+    machine repeats until their constraints hold, there is no one trajectory, and no picture. A large model costs
+    seconds a picture; without TensorBoard nothing is solved.
 
     Args:
         every: Passes between two pictures, >= 1.
@@ -41,7 +43,11 @@ class TrajectoryFigure(EveryIterations):
         """Solve, and draw."""
         if not tensorboards(trainer):
             return
-        problem = _first(from_model(model_of(pl_module)))
+        model = model_of(pl_module)
+        if any(units.n and units.bits().groups for units in (model.visible, model.hidden)):
+            self.leave_out("the ground state of categories is found by several runs of the machine")
+            return
+        problem = _first(from_model(model))
         solution = self.solver.minimise(problem, generator=rng.stream(self.seed, "trajectory"))
         if not isinstance(solution.trajectory, Trajectory):
             raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")

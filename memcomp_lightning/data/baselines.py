@@ -58,7 +58,8 @@ def independent_log_likelihood(
         train_v: ``(n, n_visible)``.
         v: The images to judge, ``(n_judged, n_visible)``.
         units: Kind of the units; None is units in {0, 1}.
-        train_observed, observed: Where the values are known, masks; None is everywhere.
+        train_observed: Where the training images are known, a mask; None is everywhere.
+        observed: Where those to judge are.
     """
     units = Bernoulli(v.shape[-1]) if units is None else copy.deepcopy(units)
     alone = RBM(visible=units, n_hidden=1).double()
@@ -69,7 +70,7 @@ def independent_log_likelihood(
         v = torch.where(observed, v, 0.0)
         known = alone.visible.site_sums(observed.double()) > 0
         log_p = torch.where(known, log_p, 0.0)
-    return float((log_p.sum(-1) - alone.visible.energy(v)).mean())
+    return (log_p.sum(-1) - alone.visible.energy(v)).mean().item()
 
 
 def _fit_and_score(

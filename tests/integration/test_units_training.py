@@ -105,5 +105,6 @@ def test_baseline_replicas_and_held_out_images(memcomp_train: Run, units: str) -
     """A network without energies, and the replica axis, see the same values."""
     few = ["data.source.copies=4", "data.partitions=2", "data.validation_fraction=0.2", "sampler=cd"]
     for own in (["model=baseline_bn_relu"], ["model.hidden_sizes=[4]", "callbacks=default"]):
-        outcome = memcomp_train(*settings(units, *own, *few, "finetune.iterations=1"), "hydra.run.dir=run/a")
+        folder = f"hydra.run.dir=run/{len(own)}"
+        outcome = memcomp_train(*settings(units, *own, *few, "finetune.iterations=1", folder))
         assert outcome.status == 0, outcome.err + outcome.out

@@ -12,6 +12,8 @@ CONF = Path(__file__).parents[3] / "conf"
 OTHERWISE = {
     ("callbacks/default", "every"): "fine-tuning has more passes than the pretraining of a layer",
     ("model/boltzmann", "n_hidden"): "in Python a list of pairs may say it",
+    ("model/rbm", "n_hidden"): "in Python the hidden units may say it",
+    ("units/categorical", "q"): "in Python each site may have its own",
     ("sampler/dwave_qpu", "beta"): "of a quantum annealer it is not known",
     ("sampler/dwave_qpu", "n_gauges"): "in Python it is one request, which a test of the chip wants",
 }
