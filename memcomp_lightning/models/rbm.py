@@ -12,7 +12,7 @@ from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Initialiser, initial
 from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
-from memcomp_lightning.models.units import Units, all_states
+from memcomp_lightning.models.units import Bernoulli, Units, all_states
 from memcomp_lightning.types import Configurations
 
 
@@ -78,8 +78,12 @@ class RBM(Machine):
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
 
     def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        weighted_v = v * weight.unsqueeze(-1)
-        return h.mT @ weighted_v, weighted_v.sum(-2), (h * weight.unsqueeze(-1)).sum(-2)
+        weighted_h = h * weight.unsqueeze(-1)
+        if isinstance(self.visible, Bernoulli):
+            weighted_v = v * weight.unsqueeze(-1)
+            return h.mT @ weighted_v, weighted_v.sum(-2), weighted_h.sum(-2)
+        # Entries of categorical units are many: no copy of them.
+        return weighted_h.mT @ v, (weight.unsqueeze(-2) @ v).squeeze(-2), weighted_h.sum(-2)
 
     def _centred_moments(
         self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor

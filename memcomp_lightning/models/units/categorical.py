@@ -94,6 +94,8 @@ class Categorical(Units):
     def sample(self, field: Values, *, generator: Generator) -> Values:
         """Draw a state a site, by inversion."""
         table = self._table(field, -torch.inf)
+        if _need_no_shift(field):
+            return self._drawn(torch.exp(table), field, generator)
         share = torch.exp_(table - table.amax(-1, keepdim=True))
         return self._drawn(share, field, generator)
 
@@ -106,7 +108,7 @@ class Categorical(Units):
         below = share.cumsum(-1)
         u = rng.uniform(share.shape[:-1], generator=generator, like=like) * below[..., -1]
         # The first state whose sum is above u: a state of share zero is never drawn.
-        index = (below <= u.unsqueeze(-1)).sum(-1)
+        index = torch.searchsorted(below, u.unsqueeze(-1), right=True).squeeze(-1)
         last = share.shape[-1] - 1 if self._q is not None else self._last(like)
         return self._one_hot(index.clamp_(max=last) if isinstance(last, int) else index.minimum(last), like)
 
@@ -231,3 +233,12 @@ class Categorical(Units):
     def beside(self, other: Units) -> "Categorical | None":
         """The sites of both."""
         return Categorical([*self.sizes, *other.sizes]) if isinstance(other, Categorical) else None
+
+
+def _need_no_shift(field: Tensor) -> bool:
+    """Whether exp(field) is far from overflow and zero; asked on the CPU alone, as other devices would wait."""
+    if field.device.type != "cpu" or not field.numel():
+        return False
+    low, high = torch.aminmax(field)
+    # Of NaN and of infinite fields this is False.
+    return float(torch.maximum(-low, high)) < math.log(torch.finfo(field.dtype).max) / 2

@@ -67,7 +67,9 @@ class Gaussian(Units):
         """Draw from N(field / precision, 1 / precision)."""
         noise = torch.empty(field.shape, dtype=field.dtype, device=generator.device)
         noise = noise.normal_(generator=generator).to(field.device)
-        return self.mean(field) + noise * self._beside(self.precision.rsqrt(), field)
+        # One pass over memory for each of two operations.
+        deviation = noise.mul_(self._beside(self.precision.rsqrt(), field))
+        return torch.addcdiv(deviation, field, self._beside(self.precision, field))
 
     def mode(self, field: Values) -> Values:
         """The mean."""
