@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from memcomp_lightning.errors import require
 from memcomp_lightning.likelihood.boltzmann import double_of, log_hidden_sum
-from memcomp_lightning.likelihood.layers import in_chunks
+from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
 from memcomp_lightning.models.base import EnergyModel, Images
 from memcomp_lightning.models.rbm import RBM
@@ -57,7 +56,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
             log_weight = lambda some: log_hidden_sum(wide, some, MOST_HIDDEN)  # noqa: E731
             found[..., sites.at] = _discrete(log_weight, rows, sites)
         for entry, site in zip(sites.real.tolist(), sites.real_at.tolist(), strict=True):
-            found[..., site] = _real(log_weight, wide, rows, entry)
+            found[..., site] = _real(log_weight, wide, rows, entry, n_numbers)
         return found
 
     if not has_free_energy(model):
@@ -163,11 +162,9 @@ def _discrete(log_weight: LogWeight, rows: Tensor, sites: _Sites) -> Tensor:
     return -torch.stack(gains).logsumexp(0)
 
 
-def _real(log_weight: LogWeight, model: EnergyModel, rows: Tensor, entry: int) -> Tensor:
+def _real(log_weight: LogWeight, model: EnergyModel, rows: Tensor, entry: int, numbers_a_row: int) -> Tensor:
     """Of a real unit: its density given the others, its integral by the trapezoidal rule."""
     curvature = model.visible.curvature
-    known = curvature is not None and bool((curvature[..., entry] > 0).all())
-    require(known, "visible units", type(model.visible).__name__, "real units that have a precision, as Gaussian")
     assert curvature is not None
     precision = curvature[..., entry]
     reach, deviation = _reach(model, entry), precision.rsqrt()
@@ -179,10 +176,12 @@ def _real(log_weight: LogWeight, model: EnergyModel, rows: Tensor, entry: int) -
     step = (high - low) / (n_nodes - 1)
     nodes = low.unsqueeze(-1) + step.unsqueeze(-1) * torch.arange(n_nodes, device=rows.device)
     total = rows.new_full(rows.shape[:-1], -torch.inf)
-    for node in nodes.unbind(-1):
-        moved = rows.clone()
-        moved[..., entry] = node.unsqueeze(-1)
-        total = torch.logaddexp(total, log_weight(moved))
+    together = max(1, NUMBERS // (rows[..., 0].numel() * numbers_a_row))
+    for some in nodes.split(together, dim=-1):
+        moved = rows.unsqueeze(-3).repeat(*[1] * (rows.ndim - 2), some.shape[-1], 1, 1)
+        moved[..., entry] = some.unsqueeze(-1)
+        log_weights = log_weight(moved.flatten(-3, -2)).unflatten(-1, (some.shape[-1], rows.shape[-2]))
+        total = torch.logaddexp(total, log_weights.logsumexp(-2))
     return log_weight(rows) - total - step.log().unsqueeze(-1)
 
 

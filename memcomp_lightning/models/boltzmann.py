@@ -353,7 +353,7 @@ def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Lay
     return found
 
 
-def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor, "n_of_entries 2"]:
+def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor, "n_entry_pairs 2"]:
     """Pairs of entries, all of one site with all of the other, in ascending order."""
     if len(site_of) == n_sites:
         return site_pairs
@@ -378,7 +378,7 @@ def _is_real(units: Units) -> Tensor:
 
 
 def _classes(n_sites: int, pairs: Pairs, real: Tensor) -> list[Tensor]:
-    """Classes of sites without couplings inside; all real ones are in one, as no other class has a list of states."""
+    """Classes of sites without couplings inside; real ones are in one, as no other class has a list of states."""
     classes = colouring(n_sites, pairs)
     if sum(bool(torch.isin(sites, real).any()) for sites in classes) <= 1:
         return classes

@@ -113,16 +113,13 @@ class Machine(nn.Module):
             value = self.total_energy(v, h, weight)
             moments = self._centred_moments(v, h, weight, visible_offset, hidden_offset)
         surrogate = self._energy_of(moments)
-        layers = (self.visible, self.b, v, visible_offset), (self.hidden, self.c, h, hidden_offset)
-        for units, bias, x, offset in layers:
-            curvature = units.curvature
-            if curvature is None or not curvature.requires_grad:
-                continue
+        curvature = self.visible.curvature
+        if curvature is not None and curvature.requires_grad:
             with torch.no_grad():
-                centred = x - offset.unsqueeze(-2)
+                centred = v - visible_offset.unsqueeze(-2)
                 squares = 0.5 * (weight.unsqueeze(-2) @ centred.square()).squeeze(-2)
-                along = _learned(units).to(squares.device) * offset * squares
-            surrogate = surrogate + vecdot(curvature, squares) + vecdot(bias, along)
+                along = _learned(self.visible).to(squares.device) * visible_offset * squares
+            surrogate = surrogate + vecdot(curvature, squares) + vecdot(self.b, along)
         return value + (surrogate - surrogate.detach())
 
     def _of_measures(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor | float:

@@ -36,7 +36,7 @@ class RBM(Machine):
         n_visible: Number of visible units in {0, 1}, >= 1; None where ``visible`` says it.
         n_hidden: Number of hidden units in {0, 1}, >= 1; None where ``hidden`` says it.
         visible: Kind of the visible units, see :mod:`memcomp_lightning.models.units`.
-        hidden: Kind of the hidden units. Real ones ask for visible units that are not.
+        hidden: Kind of the hidden units. Real ones ask for visible units that are not; their precision is fixed.
         replicas: Leading axes of independent machines that share every call.
         weight_init: Draws the weights; the biases start at zero.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
@@ -66,6 +66,9 @@ class RBM(Machine):
         kinds = f"{type(visible).__name__} and {type(hidden).__name__}"
         allowed = "real units in one layer at most, as Z may be infinite otherwise"
         require(not both, "kinds of visible and hidden units", kinds, allowed)
+        learned = hidden.curvature is not None and hidden.curvature.requires_grad
+        remedy = "The weights set the scale of hidden units: take Gaussian(n, learned=False)."
+        require(not learned, "precision of the hidden units", "learned", "a fixed one", remedy)
         super().__init__(visible.for_replicas(replicas), hidden.for_replicas(replicas))
         weight = initial((*replicas, hidden.n, visible.n), weight_init, generator)
         self.weight = nn.Parameter(weight)

@@ -1,6 +1,7 @@
 """Networks of one shape side by side on the replica axis."""
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -29,14 +30,14 @@ def stacked(networks: Sequence[ModuleT], replicas: tuple[int, ...]) -> ModuleT:
     states = [network.state_dict() for network in networks]
     shapes = [{name: tuple(x.shape) for name, x in state.items()} for state in states]
     require(all(shape == shapes[0] for shape in shapes), "networks", shapes, "networks of one shape")
-    parameters = dict(whole.named_parameters())
+    parameters, n = dict(whole.named_parameters()), len(networks) * math.prod(replicas)
     for name, tensor in states[0].items():
         if not tensor.is_floating_point():  # indices of units, the same in all replicas
             alike = all(tensor.equal(state[name]) for state in states)
             require(alike, name, "different", "the same in all networks")
             continue
         own_axes = tensor.shape[len(replicas) :]
-        together = torch.stack([state[name] for state in states]).reshape(-1, *own_axes)
+        together = torch.stack([state[name] for state in states]).reshape(n, *own_axes)
         owner, _, own_name = name.rpartition(".")
         if name in parameters:
             together = nn.Parameter(together, requires_grad=parameters[name].requires_grad)

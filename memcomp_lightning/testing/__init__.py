@@ -1,4 +1,4 @@
-"""What other projects test their own parts with: conformance of samplers, solvers and units, statistical checks."""
+"""What other projects test their own parts with: conformance of samplers, solvers and units, statistics."""
 
 from memcomp_lightning.testing.conformance import (
     check_sampler,

@@ -1,7 +1,7 @@
 """What a model says, by sums over all its states and integrals by quadrature, from its parameters alone.
 
 Slow and obvious: nothing here asks a model for an energy, a mean or a cumulant. Everything follows from one
-function, :func:`log_sum`. Its derivatives by the parameters are gradients of likelihoods, those by biases are means.
+function, :func:`log_sum`. Its derivatives by parameters are gradients of likelihoods; by biases they are means.
 """
 
 import itertools

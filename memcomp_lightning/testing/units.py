@@ -81,7 +81,7 @@ def small_rbms() -> Makers:
     return found | {
         "spins below more spins": partial(_rbm, Spin(3), Spin(5)),
         "categories below more bits": partial(_rbm, Categorical([2, 3]), Bernoulli(4)),
-        "bits x real": partial(_rbm, Bernoulli(4), Gaussian(2, variance=0.8)),
+        "bits x real": partial(_rbm, Bernoulli(4), Gaussian(2, variance=0.8, learned=False)),
     }
 
 

@@ -107,7 +107,7 @@ class Units(nn.Module):
     # -------------------------------------------------------------------------------------------- measure
 
     def total_energy(self, x: Values, weight: Float[Tensor, "*axes"]) -> Float[Tensor, "*replicas"]:
-        """Weighted sum of ``energy`` over the rows of x, ``(*replicas, n_rows, n)``, which are constants to autograd."""
+        """Weighted sum of ``energy`` over the rows of x, ``(*replicas, n_rows, n)``, constants to autograd."""
         return (weight * self.energy(x)).sum(-1)
 
     @property
@@ -184,7 +184,7 @@ class Units(nn.Module):
 
     def bits(self) -> Bits:
         """How the layer is written in bits for a QUBO; entries with a curvature may be left out."""
-        raise self._without("a form in bits, as a QUBO needs it")
+        raise self._without("a form in bits, as QUBOs and pseudo-likelihoods need it")
 
     # -------------------------------------------------------------------------------------------- entries
 
