@@ -357,7 +357,7 @@ def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor,
     """Pairs of entries, all of one site with all of the other, in ascending order."""
     if len(site_of) == n_sites:
         return site_pairs
-    entries = [(site_of == site).nonzero().flatten() for site in range(n_sites)]
+    entries = torch.arange(len(site_of)).split(torch.bincount(site_of, minlength=n_sites).tolist())
     found = torch.cat([torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist()])
     return found[(found[:, 0] * len(site_of) + found[:, 1]).argsort()]
 
