@@ -23,7 +23,7 @@ class EnergyHistograms(EveryIterations):
     The histograms ``energies_data`` and ``energies_model`` have the same bins, and the picture ``energies`` shows
     them on top of each other: a well-trained model overlaps the data. Energies E(v, h) are those of the pass's
     last batch under the updated model, over all replicas; configurations of the negative phase count by their
-    weights.
+    weights. Nothing is drawn where these are signed, as with the pseudo-likelihood.
 
     Args:
         every: Passes between two pictures, >= 1.
@@ -45,6 +45,8 @@ class EnergyHistograms(EveryIterations):
         energies, weights = {}, {}
         for name, configurations in (("data", step["positive"]), ("model", step["negative"])):
             share = shares(configurations).double().flatten().cpu()
+            if bool((share < 0).any()):
+                return
             energy = model.energy(configurations.v, configurations.h).double().flatten().cpu()
             energies[name] = energy[share > 0].numpy()
             weights[name] = share[share > 0].numpy() * configurations.v.shape[-2]

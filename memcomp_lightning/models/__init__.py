@@ -3,9 +3,11 @@
 from memcomp_lightning.models.base import Block, Chains, EnergyModel, QuadraticForm, TwoLayers, as_two_layers
 from memcomp_lightning.models.bit_form import BitForm, bit_form, descend, read_bits
 from memcomp_lightning.models.boltzmann import BoltzmannMachine
+from memcomp_lightning.models.couplings import Couplings, contact_scores, couplings
 from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
+from memcomp_lightning.models.gauge import zero_sum
 from memcomp_lightning.models.init import Gaussian, Initialiser, Uniform, Xavier, independent_bias, start_at_means
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.parts import energy_models, joint_model
@@ -23,6 +25,7 @@ __all__ = [
     "Block",
     "BoltzmannMachine",
     "Chains",
+    "Couplings",
     "EnergyModel",
     "Gaussian",
     "GaussianMoments",
@@ -37,6 +40,8 @@ __all__ = [
     "Xavier",
     "as_two_layers",
     "bit_form",
+    "contact_scores",
+    "couplings",
     "descend",
     "energy_models",
     "hidden_blocks",
@@ -47,4 +52,5 @@ __all__ = [
     "stacked",
     "start_at_means",
     "with_batch_norm_relu",
+    "zero_sum",
 ]

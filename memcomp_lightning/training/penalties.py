@@ -93,7 +93,9 @@ class GroupSparsity:
 
 def with_penalties(gap: Tensor, model: EnergyModel, penalties: Sequence[Penalty]) -> Tensor:
     """A contrast ``(*replicas,)`` and what the penalties add to it."""
-    return sum((penalty(model) for penalty in penalties), start=gap)
+    for penalty in penalties:
+        gap = gap + penalty(model)
+    return gap
 
 
 def _couplings(model: EnergyModel) -> Tensor:
@@ -109,7 +111,9 @@ def _groups(model: EnergyModel) -> Tensor:
         return (first.unsqueeze(-1) * visible.n_sites + second).flatten()
     site_of = torch.cat((_site_of(visible, model), _site_of(model.hidden, model) + visible.n_sites))
     first, second = site_of[form.pairs].unbind(-1)
-    return (first * (visible.n_sites + model.hidden.n_sites) + second).unique(return_inverse=True)[1]
+    pair = first * (visible.n_sites + model.hidden.n_sites) + second
+    number: Tensor = pair.unique(return_inverse=True)[1]
+    return number
 
 
 def _site_of(units: Units, model: EnergyModel) -> Tensor:

@@ -200,6 +200,10 @@ class Units(nn.Module):
         """Sums over the entries of each site."""
         return x
 
+    def zero_sum(self, x: Values) -> Values:
+        """Numbers of entries in the zero-sum gauge: those of categorical sites less their mean over the site."""
+        return x
+
     def select(self, entries: Tensor) -> "Units":
         """A layer of some entries, whole sites in rising order, with copies of the kind's own parameters."""
         return type(self)(len(entries))

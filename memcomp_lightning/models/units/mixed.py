@@ -197,6 +197,10 @@ class Mixed(Units):
         """Of each part."""
         return self._each(lambda kind, part: kind.site_sums(part), x)
 
+    def zero_sum(self, x: Values) -> Values:
+        """Of each part."""
+        return self._each(lambda kind, part: kind.zero_sum(part), x)
+
     def select(self, entries: Tensor) -> Units:
         """Some of the sites, of whichever parts."""
         found, begin = [], 0
