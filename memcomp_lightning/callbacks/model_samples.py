@@ -3,7 +3,7 @@
 import lightning.pytorch as pl
 from torch import Tensor
 
-from memcomp_lightning import rng
+from memcomp_lightning.callbacks.against_samples import fresh_chains
 from memcomp_lightning.callbacks.base import model_of
 from memcomp_lightning.callbacks.pictures import Pictures, inputs_of
 from memcomp_lightning.errors import require_count
@@ -30,10 +30,5 @@ class ModelSamples(Pictures):
     def tiles(self, pl_module: pl.LightningModule, outputs: object) -> Tensor:
         """Run the chains and project them down to the inputs."""
         model = model_of(pl_module)
-        generator = rng.stream(self.seed, "evaluation")
-        chains = model.chains()
-        x = chains.random(self.n_pictures, generator=generator)
-        for _ in range(self.n_sweeps):
-            x = chains.sweep(x, generator=generator)
-        states = chains.read(x)
+        states = model.chains().read(fresh_chains(model, self.n_pictures, self.n_sweeps, self.seed))
         return inputs_of(pl_module, model.visible_mean(states.h) if model.n_hidden else states.v)

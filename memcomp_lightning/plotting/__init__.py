@@ -1,15 +1,23 @@
-"""Draw arrays: grids of pictures, histograms, gaps of solvers, and trajectories of a DMM."""
+"""Draw arrays: grids of pictures, histograms, states of categories, gaps of solvers, and trajectories of a DMM."""
 
+from memcomp_lightning.plotting.densities import plot_densities
 from memcomp_lightning.plotting.gaps import plot_gaps
 from memcomp_lightning.plotting.grid import picture_grid
 from memcomp_lightning.plotting.histograms import plot_histograms
+from memcomp_lightning.plotting.logo import plot_logo
 from memcomp_lightning.plotting.rendering import rendered
+from memcomp_lightning.plotting.state_frequencies import plot_state_frequencies
+from memcomp_lightning.plotting.state_weights import plot_state_weights
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 
 __all__ = [
     "picture_grid",
+    "plot_densities",
     "plot_gaps",
     "plot_histograms",
+    "plot_logo",
+    "plot_state_frequencies",
+    "plot_state_weights",
     "plot_trajectory",
     "rendered",
 ]

@@ -1,0 +1,52 @@
+"""How values of real units are distributed in the data and in samples of the model."""
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from memcomp_lightning.callbacks.against_samples import AgainstSamples, kinds_in
+from memcomp_lightning.errors import require_count
+from memcomp_lightning.models.units import Units
+from memcomp_lightning.plotting.densities import plot_densities
+
+
+class Densities(AgainstSamples):
+    """Draws histograms of data and samples for a few real visible units: picture ``densities``.
+
+    The units are those that vary most in the data. Of visible units none of which is real there is no picture.
+
+    Args:
+        every: Passes between two pictures, >= 1.
+        n_images: Training images to take, >= 1.
+        n_samples: Chains, >= 1.
+        n_sweeps: Gibbs sweeps of each chain, >= 1.
+        n_units: Most units to draw, >= 1.
+        seed: Seed of the chains.
+    """
+
+    def __init__(
+        self,
+        every: int = 20,
+        n_images: int = 1000,
+        n_samples: int = 500,
+        n_sweeps: int = 100,
+        n_units: int = 6,
+        seed: int = 0,
+    ) -> None:
+        super().__init__("densities", every, n_images, n_samples, n_sweeps, seed)
+        require_count("n_units", n_units)
+        self.n_units = n_units
+
+    def has_units(self, units: Units) -> bool:
+        """Whether some are real."""
+        return units.real
+
+    def figure(self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor) -> Figure:
+        """The histograms."""
+        real = torch.cat([torch.arange(at.start, at.stop) for kind, at in kinds_in(units) if kind.real])
+        seen = data if observed is None else torch.where(observed, data, torch.nan)
+        seen = seen[:, real]
+        variance = (seen - seen.nanmean(0)).square().nanmean(0).nan_to_num(nan=0.0)
+        chosen = torch.topk(variance, min(self.n_units, len(real))).indices.sort().values
+        names = [f"unit {unit}" for unit in real[chosen].tolist()]
+        return plot_densities(seen[:, chosen].numpy(), samples[:, real[chosen]].numpy(), names)
