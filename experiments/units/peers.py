@@ -9,7 +9,8 @@ PEERS is an environment of its own, without memcomp_lightning:
     PEERS/bin/pip install torch==2.13.0 numpy scipy h5py pandas biopython matplotlib seaborn tqdm
     PEERS/bin/pip install --no-deps adabmDCA==1.0.0 rbms==0.5.0
 
-`train.npz` holds `indices`, (n, L) integers in 0..20 in the order of `ALPHABET`, and perhaps `weights`, (n,).
+`train.npz` holds `indices`, (n, L) numbers of letters, perhaps `alphabet`, these letters, if they are not those of
+`site_statistics.ALPHABET`, and perhaps `weights`, (n,).
 
     adabmDCA   a Potts model of all pairs of sites (bmDCA), persistent chains, Metropolis
     rbms       an RBM of Potts visible and Bernoulli hidden units (PBRBM), persistent chains, block Gibbs
@@ -18,8 +19,10 @@ Each peer has its own defaults but for what `--settings` changes. The rows are t
 weights of `train.npz` or equal ones: left to themselves both peers drop rows that stand twice, and adabmDCA weighs
 each row by its number of neighbours. Samples are chains that begin in uniformly random states.
 
-`--out` gets `indices`, (n_samples, L), and `chains`, the persistent chains at the end of training. Beside it lies
-a .json with the seconds of training and of sampling, what ended training, and the settings.
+`--seconds` are those of the processor, which do not count where it works for somebody else; with more than one
+thread those of all add up. `--out` gets `indices`, (n_samples, L), and `chains`, the persistent chains at the end
+of training. Beside it lies a .json with the seconds of training and of sampling, what ended training, and the
+settings.
 """
 
 import argparse
@@ -36,7 +39,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from site_statistics import ALPHABET, N_STATES
+from site_statistics import ALPHABET, RNA
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,14 @@ class Limits:
 
 @dataclass
 class Clock:
-    """Seconds since it was made, and whether a number of them has passed."""
+    """Seconds since it was made, and whether a number of them has passed on the processors."""
 
     limit: float | None = None
     begun: float = field(default_factory=time.perf_counter)
     begun_at_work: float = field(default_factory=time.process_time)
 
     def over(self) -> bool:
-        return self.limit is not None and time.perf_counter() - self.begun >= self.limit
+        return self.limit is not None and time.process_time() - self.begun_at_work >= self.limit
 
     def report(self, what: str) -> dict[str, float]:
         """Seconds on the wall, and of processors: they differ where others have work for the same ones."""
@@ -91,7 +94,7 @@ class Latest:
         self.chains = chains
 
 
-def adabmdca(rows, weights, limits, settings, seed, n_samples, n_sweeps):
+def adabmdca(rows, alphabet, weights, limits, settings, seed, n_samples, n_sweeps):
     """Trains adabmDCA's Potts model as its `train_model` does, but with an end after some seconds.
 
     `train_model` loses the model when it is cancelled, so its steps stand here; each is a function of the package.
@@ -120,12 +123,13 @@ def adabmdca(rows, weights, limits, settings, seed, n_samples, n_sweeps):
     config = TrainingConfig(**{"device": "cpu", "seed": seed} | settings | ends)
     device, dtype = resolve_runtime(config.device, config.dtype)
 
+    kind = {ALPHABET: "protein", RNA: "rna"}[alphabet]
     clock = Clock(limits.seconds)
-    sequences = tuple("".join(ALPHABET[state] for state in row) for row in rows)
+    sequences = tuple("".join(alphabet[state] for state in row) for row in rows)
     dataset = DatasetDCA.from_alignment(
         Alignment(names=tuple(map(str, range(len(rows)))), sequences=sequences),
         weights=weights,
-        load_config=AlignmentLoadConfig(alphabet="protein", invalid_sequences="error", remove_duplicates=False),
+        load_config=AlignmentLoadConfig(alphabet=kind, invalid_sequences="error", remove_duplicates=False),
         no_reweighting=weights is None,
         device=device,
         dtype=dtype,
@@ -160,13 +164,13 @@ def adabmdca(rows, weights, limits, settings, seed, n_samples, n_sweeps):
 
     clock = Clock()
     sampled = sample_sequences(
-        model=DCAModel(parameters, alphabet="protein"),
+        model=DCAModel(parameters, alphabet=kind),
         n_sequences=n_samples,
         n_sweeps=n_sweeps,
         sampler=config.sampler,
         seed=seed + 1,
     )
-    state_of = {letter: state for state, letter in enumerate(ALPHABET)}
+    state_of = {letter: state for state, letter in enumerate(alphabet)}
     indices = np.array([[state_of[letter] for letter in sequence] for sequence in sampled.sequences])
     reason = controller.stop_reason.value
     ended = {"cancelled": "seconds", "max_gradient_steps": "updates"}.get(reason, reason)
@@ -188,7 +192,7 @@ def adabmdca(rows, weights, limits, settings, seed, n_samples, n_sweeps):
     )
 
 
-def rbms(rows, weights, limits, settings, seed, n_samples, n_sweeps):
+def rbms(rows, alphabet, weights, limits, settings, seed, n_samples, n_sweeps):
     """Trains rbms' Potts-Bernoulli RBM as its `train` does, but with an end after some seconds, and no files.
 
     `train` writes the model at some updates and learning rates at each one; the seconds here are without that.
@@ -226,8 +230,8 @@ def rbms(rows, weights, limits, settings, seed, n_samples, n_sweeps):
         is_binary=False,
         device="cpu",
     )
-    if data.get_num_states() != N_STATES:
-        raise SystemExit(f"rbms counts states by the largest one; state {N_STATES - 1} is in no training row")
+    if data.get_num_states() != len(alphabet):
+        raise SystemExit(f"rbms counts states by the largest one; state {len(alphabet) - 1} is in no training row")
     shares = None if weights is None else torch.as_tensor(weights)
     updates = 0
     with torch.no_grad():
@@ -288,14 +292,15 @@ def thinned(values, n_kept=100):
 
 
 def read(path):
-    """Rows and weights of a file, refused where they are not what the module's text says."""
+    """Rows, their letters and weights of a file, refused where they are not what the module's text says."""
     with np.load(path) as file:
         rows, weights = file["indices"].astype(np.int64), file.get("weights")
-    if rows.ndim != 2 or rows.min() < 0 or rows.max() >= N_STATES:
-        raise SystemExit(f"{path}: indices of shape {rows.shape}: expected (n, L) integers in 0..{N_STATES - 1}")
+        alphabet = str(file["alphabet"]) if "alphabet" in file else ALPHABET
+    if rows.ndim != 2 or rows.min() < 0 or rows.max() >= len(alphabet):
+        raise SystemExit(f"{path}: indices of shape {rows.shape}: expected (n, L) integers below {len(alphabet)}")
     if weights is not None and weights.shape != (len(rows),):
         raise SystemExit(f"{path}: weights of shape {weights.shape}: expected ({len(rows)},)")
-    return rows, weights
+    return rows, alphabet, weights
 
 
 def arguments():
@@ -303,7 +308,7 @@ def arguments():
     parser.add_argument("--peer", choices=PEERS, required=True)
     parser.add_argument("--train", type=Path, required=True, help="an .npz with indices and perhaps weights")
     parser.add_argument("--out", type=Path, required=True, help="an .npz for the samples; a .json goes beside it")
-    parser.add_argument("--seconds", type=float, help="training ends after so many")
+    parser.add_argument("--seconds", type=float, help="of a processor: training ends after so many")
     parser.add_argument(
         "--updates", "--epochs", type=int, help="... or after so many gradients; the peer's default"
     )
@@ -317,13 +322,14 @@ def arguments():
 
 def main():
     given = arguments()
-    rows, weights = read(given.train)
+    rows, alphabet, weights = read(given.train)
     import torch
 
     torch.set_num_threads(given.threads)
     torch.manual_seed(given.seed)  # noqa: TID251 - the peers draw from the global generator
     limits = Limits(given.seconds, given.updates)
-    outcome = PEERS[given.peer](rows, weights, limits, given.settings, given.seed, given.samples, given.sweeps)
+    train = PEERS[given.peer]
+    outcome = train(rows, alphabet, weights, limits, given.settings, given.seed, given.samples, given.sweeps)
     report = {
         "peer": given.peer,
         "version": version(given.peer),

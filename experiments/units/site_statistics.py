@@ -13,6 +13,7 @@ import numpy as np
 N_STATES = 21
 """Twenty amino acids and the gap, in the order of ALPHABET."""
 ALPHABET = "-ACDEFGHIKLMNPQRSTVWY"
+RNA = "-ACGU"
 
 _ROWS_AT_ONCE = 2048
 
