@@ -54,7 +54,7 @@ class SamplerDiagnostics(EveryIterations):
             return {}
         if prefix_of(module) != self._stage or self._v is None or self._v.shape != negative.v.shape:
             self._stage, self._energies, self._v = prefix_of(module), [], None
-        values = {}
+        values: dict[str, Tensor] = {}
         v = negative.v.detach().clone().cpu()  # a sampler of somebody else's may go on in the same tensor
         if self._v is not None:
             values |= _changed(model_of(module).visible, v, self._v)

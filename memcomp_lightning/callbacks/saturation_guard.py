@@ -136,4 +136,5 @@ def _means(positive: Configurations, v: Tensor | None) -> Tensor:
     if v is None or weight is None or h.shape[-2] == v.shape[-2]:
         return h
     weight = weight.unflatten(-1, (v.shape[-2], -1)).unsqueeze(-1)
-    return (h.unflatten(-2, (v.shape[-2], -1)) * weight).sum(-2) / weight.sum(-2)
+    means: Tensor = (h.unflatten(-2, (v.shape[-2], -1)) * weight).sum(-2) / weight.sum(-2)
+    return means

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ def letter_heights(frequencies: NDArray[np.floating]) -> NDArray[np.float64]:
     return heights
 
 
-def _glyph(letter: str) -> TextPath:
+def _glyph(letter: str) -> Outline:
     """The outline of a letter, of which the box is one wide and one high."""
     path = TextPath((0, 0), letter, size=1, prop=FontProperties(family="DejaVu Sans", weight="bold"))
     box = path.get_extents()
@@ -74,7 +75,7 @@ def _glyph(letter: str) -> TextPath:
     return Affine2D().translate(-middle, -bottom).scale(1 / width, 1 / height).transform_path(path)
 
 
-def _stack(axes: Axes, glyphs: list[TextPath], site: int, heights: NDArray[np.float64], smallest: float) -> None:
+def _stack(axes: Axes, glyphs: list[Outline], site: int, heights: NDArray[np.float64], smallest: float) -> None:
     """The letters of one site, the highest on top."""
     below = 0.0
     for state in np.argsort(np.nan_to_num(heights)):
