@@ -9,9 +9,10 @@ from memcomp_lightning.likelihood import log_likelihood, log_partition_function
 from memcomp_lightning.models import RBM, BoltzmannMachine, observed, start_at_means
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin, Units
 from memcomp_lightning.objective import contrast
-from memcomp_lightning.samplers import ExactPosterior
+from memcomp_lightning.samplers import ClampedGibbs, ExactPosterior, MeanField
 from memcomp_lightning.samplers.positive import exact
 from memcomp_lightning.testing import brute_force, small_machines, small_rbms
+from memcomp_lightning.types import Configurations
 
 
 def coupled_visible(model):
@@ -69,6 +70,16 @@ def test_likelihood_is_that_of_what_is_observed(name):
     check_likelihood(name)
 
 
+def part(model, make, at):
+    """The model of one replica."""
+    alone = make().double()
+    with torch.no_grad():
+        for key, tensor in alone.state_dict().items():
+            if tensor.is_floating_point():
+                tensor.copy_(model.state_dict()[key][at])
+    return alone
+
+
 def positive_phase(model, v, known):
     return ExactPosterior().sample(model, v, observed=known, generator=rng.stream(0, "unused")).configurations
 
@@ -99,11 +110,7 @@ def test_replicas_have_masks_of_their_own(name):
     positive = positive_phase(model, v, known)
     found = torch.autograd.grad(model.mean_energy(positive).sum(), list(model.parameters()))
     for at in range(2):
-        alone = make().double()
-        with torch.no_grad():
-            for key, tensor in alone.state_dict().items():
-                if tensor.is_floating_point():
-                    tensor.copy_(model.state_dict()[key][at])
+        alone = part(model, make, at)
         close(log_p[at], log_likelihood(alone, v[at], log_z[at], observed=known[at]))
         own = positive_phase(alone, v[at], known[at])
         gradient = torch.autograd.grad(alone.mean_energy(own), list(alone.parameters()))
@@ -128,6 +135,84 @@ def test_where_nothing_is_observed_the_probability_is_one():
     log_z = log_partition_function(model)
     nothing = torch.zeros_like(known)
     close(log_likelihood(model, v, log_z, observed=nothing), torch.zeros(len(v), dtype=torch.float64))
+
+
+# --- where it cannot be summed ----------------------------------------------------------------------------
+
+ALL = small_rbms() | small_machines()
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if not ALL[name]().hidden.real])
+def test_mean_field_of_what_is_missing_is_its_fixed_point(name):
+    model = ALL[name](replicas=(2,)).double()
+    v, known = masked(model)
+    found = MeanField(max_iterations=2000, tolerance=1e-12).sample(
+        model, v, observed=known, generator=rng.stream(0, "unused")
+    )
+    assert bool(found.info["mean_field_converged"].all())
+    n_points = found.configurations.v.shape[-2] // v.shape[-2]
+    assert n_points == (1 if model.visible.linear else 2)
+    filled, h = (x.unflatten(-2, (-1, n_points)) for x in found.configurations[:2])
+    means = filled.mean(-2)
+    assert means[known].equal(v[known])
+    for at in range(2):
+        alone = part(model, ALL[name], at)
+        bias = torch.cat((alone.b, alone.c)).detach()
+        x = torch.cat((means[at], h[at, :, 0]), dim=-1)
+        field = x @ brute_force.couplings(alone).detach() + bias
+        n = model.n_visible
+        close(h[at, :, 0], alone.hidden.mean(field[:, n:]), 1e-8)
+        expected = alone.visible.mean(field[:, :n]).detach()
+        close(means[at], torch.where(known[at], v[at], expected), 1e-8)
+        for site in brute_force.sites_of(alone.visible):
+            if site.precision is not None:
+                entry = site.entries[0]
+                spread = filled[at, :, :, entry].var(-1, correction=0)
+                variance = torch.where(known[at, :, entry], 0.0, 1 / site.precision.detach())
+                close(spread, variance)
+
+
+def check_chains(name):
+    """The gradient of the energy, for each row of data; its error is that of batches of chains."""
+    model = ALL[name]().double()
+    v, known = (x[:2] for x in masked(model))  # few and many known values
+    n_batches, n_chains, parameters = 20, 200, list(model.parameters())
+    sampler = ClampedGibbs(k=12, n_chains=n_batches * n_chains)
+    found = sampler.sample(model, v, observed=known, generator=rng.stream(0, "chains")).configurations
+    x = torch.cat((v, v.new_zeros(len(v), model.n_hidden)), dim=-1)
+    at = torch.cat((known, torch.zeros(len(v), model.n_hidden, dtype=torch.bool)), dim=-1)
+    of_rows = (some.view(len(v), n_batches, n_chains, -1) for some in found[:2])
+    for row, (chains, hidden) in enumerate(zip(*of_rows, strict=True)):
+        assert bool((chains == v[row])[..., known[row]].all())
+        expected = torch.autograd.grad(-brute_force.log_sum(model, x[row], at[row]), parameters)
+        batches = [
+            torch.autograd.grad(model.mean_energy(Configurations(*some)), parameters)
+            for some in zip(chains, hidden, strict=True)
+        ]
+        for one, true in zip(zip(*batches, strict=True), expected, strict=True):
+            if true.numel():
+                ours = torch.stack(one)
+                # Student's t of 19 degrees of freedom: once in 10^7.
+                error = ours.std(0) / n_batches**0.5
+                assert bool(((ours.mean(0) - true).abs() <= 9 * error + 1e-9).all())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "spins x bits",
+        "categories x ReLU",
+        "real x spins",
+        "mixed x bits",
+        "spins, all pairs",
+        "mixed",
+        "mixed alone",
+        "categories alone",
+        "DBM of mixed units",
+    ],
+)
+def test_gibbs_chains_of_what_is_missing_have_the_expectations(name):
+    check_chains(name)
 
 
 # --- masks that are refused -------------------------------------------------------------------------------
@@ -262,6 +347,20 @@ MUTANTS = {
         lambda right: lambda model, h: 0.5 * right(model, h),
         check_gradient,
         "bits x spins",
+    ),
+    "chains: too hot": (
+        Spin,
+        "sample",
+        lambda right: lambda self, field, *, generator: right(self, 0.7 * field, generator=generator),
+        check_chains,
+        "spins, all pairs",
+    ),
+    "chains: too wide": (
+        Gaussian,
+        "sample",
+        lambda right: lambda self, field, *, generator: 1.2 * right(self, field, generator=generator),
+        check_chains,
+        "mixed",
     ),
     "likelihood: the mask is not looked at": (
         "memcomp_lightning.likelihood.exact",
