@@ -2,6 +2,7 @@
 
 from memcomp_lightning.optional import on_demand
 from memcomp_lightning.samplers.base import NegativePhaseSampler, positive_phase, tensors_of, with_tensors
+from memcomp_lightning.samplers.block_annealing import BlockAnnealing
 from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.exact import Exact
 from memcomp_lightning.samplers.ground_state import GroundState
@@ -21,6 +22,7 @@ from memcomp_lightning.samplers.quench import Quench
 __all__ = [
     "CD",
     "PCD",
+    "BlockAnnealing",
     "ClampedGibbs",
     "Exact",
     "ExactPosterior",

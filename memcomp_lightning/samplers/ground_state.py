@@ -8,24 +8,20 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_choice, require_parts
 from memcomp_lightning.models.base import EnergyModel, as_two_layers
-from memcomp_lightning.models.bit_form import descend, read_bits, with_real_spread
-from memcomp_lightning.problems.constrained import Constrained, exactly
+from memcomp_lightning.models.bit_form import read_bits, with_real_spread
 from memcomp_lightning.problems.from_model import from_bit_form
+from memcomp_lightning.samplers.one_hot import minimise_in_groups
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
-from memcomp_lightning.solvers.constrained import PenaltyLoop
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
-
-MOST_TURNS = 2
-"""Turns of penalties for categorical units: what breaks a constraint is mended, and an update cannot wait."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GroundState:
     """Takes the state of lowest energy as the negative phase (Manukian et al. 2019, section 3.2).
 
-    Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model. Of
-    categorical units it gets a bit a state with a hard constraint a site, and the answer descends to where no
-    layer alone can improve it. Real units are integrated out.
+    Each update the solver gets the energy as a QUBO, and its answer stands for the expectation under the model.
+    Of categorical units it gets a bit a state with a penalty a site, and its answers descend to where no class of
+    units alone can improve them (:mod:`~memcomp_lightning.samplers.one_hot`). Real units are integrated out.
 
     Attributes:
         solver: Finds low energies of the QUBO.
@@ -68,31 +64,27 @@ class GroundState:
         """Return x* or the weighted trajectory; real units stand at two points around their means."""
         posed, order = posed_as(model)
         form = posed.in_bits()
-        qubo = from_bit_form(form)
         if form.groups:
-            constrained = Constrained.of(qubo, [exactly(1, group) for group in form.groups])
-            solution = PenaltyLoop(solver=self.solver, n_turns=MOST_TURNS).minimise(
-                constrained, generator=generator
-            )
+            solution, found, info = minimise_in_groups(posed, form, self.solver, generator=generator)
         else:
-            solution = self.solver.minimise(qubo, generator=generator)
-        if self.readout == "best":
-            bits, weight = solution.best.unsqueeze(-2), None
-        else:
-            visited = solution.trajectory
-            if visited is None:
-                raise ValueError(
-                    "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
-                )
-            bits = visited.assignments.flatten(-3, -2)
-            weight = visited.weights().flatten(-2).to(model.b.dtype)
-        found = read_bits(posed, form, bits)._replace(weight=weight)
-        if form.groups:
-            found = descend(posed, found)
+            solution, info = self.solver.minimise(from_bit_form(form), generator=generator), {}
+            bits, weight = self._read(solution, model.b.dtype)
+            found = read_bits(posed, form, bits)._replace(weight=weight)
         v, h, weight = with_real_spread(posed, found)
         if order is not None:
             v, h = torch.cat((v, h), dim=-1)[..., order].split((model.n_visible, model.n_hidden), dim=-1)
-        return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution))
+        return NegativePhase(Configurations(v, h, weight), state, _diagnostics(solution) | info)
+
+    def _read(self, solution: QuboSolution, dtype: torch.dtype) -> tuple[Tensor, Tensor | None]:
+        """Bits that stand for the ground state, ``(*replicas, n, n_bits)``, and their weights."""
+        if self.readout == "best":
+            return solution.best.unsqueeze(-2), None
+        visited = solution.trajectory
+        if visited is None:
+            raise ValueError(
+                "readout = 'time_average' needs a trajectory, but the solver returned none: let it record one."
+            )
+        return visited.assignments.flatten(-3, -2), visited.weights().flatten(-2).to(dtype)
 
 
 def posed_as(model: EnergyModel) -> tuple[EnergyModel, Tensor | None]:

@@ -1,0 +1,176 @@
+"""Ground states of models of all units, by each solver and by annealing in blocks, against enumeration."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.models import units
+from memcomp_lightning.models.bit_form import at_real_means
+from memcomp_lightning.samplers import BlockAnnealing, GroundState, ModeAssisted, ModeSchedule, one_hot
+from memcomp_lightning.samplers.mode_assisted import mode_scale
+from memcomp_lightning.samplers.one_hot import bits_of
+from memcomp_lightning.solvers import (
+    AlternatingDescent,
+    BruteForce,
+    CrossoverAnnealing,
+    GibbsAnnealing,
+    Portfolio,
+    TabuSearch,
+)
+from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.testing import enumerated, small_dbm, small_machine, small_rbm
+from memcomp_lightning.types import Configurations
+
+VARIANCE = torch.tensor([0.5, 1.0, 2.0, 1.5, 0.7])
+MIXED = units.Mixed(units.Spin(2), units.Categorical([3, 4]), units.Gaussian(2, variance=VARIANCE[:2]))
+MODELS = {
+    "Potts RBM": partial(small_rbm, visible=units.Categorical(3, q=3), hidden=units.Bernoulli(5)),
+    "Potts RBM of several sizes": partial(
+        small_rbm, visible=units.Categorical([2, 4, 3, 5]), hidden=units.Categorical([3, 2])
+    ),
+    "Potts machine": partial(small_machine, visible=units.Categorical([3, 4, 3]), hidden=units.Bernoulli(4)),
+    "Potts DBM": partial(small_dbm, visible=units.Categorical(3, q=4)),
+    "spins": partial(small_rbm, visible=units.Spin(9), hidden=units.Spin(7)),
+    "Ising machine": partial(small_machine, visible=units.Spin(9), hidden=units.Spin(4)),
+    "real units": partial(small_rbm, visible=units.Gaussian(5, variance=VARIANCE), hidden=units.Spin(12)),
+    "real and categories": partial(small_rbm, visible=units.Gaussian(5), hidden=units.Categorical([3, 4, 2, 3])),
+    "mixed RBM": partial(small_rbm, visible=MIXED, hidden=units.Bernoulli(6)),
+    "mixed machine": partial(small_machine, visible=MIXED, hidden=units.Spin(3)),
+}
+SAMPLERS = {
+    "brute force": GroundState(solver=BruteForce()),
+    "the DMM": GroundState(solver=DmmSolver(n_restarts=16, max_steps=400)),
+    "annealing": GroundState(solver=GibbsAnnealing(n_restarts=64)),
+    "the portfolio": GroundState(solver=Portfolio()),
+    "tabu search": GroundState(solver=TabuSearch(n_restarts=16)),
+    "crossover": GroundState(solver=CrossoverAnnealing(n_restarts=16)),
+    "descent": GroundState(solver=AlternatingDescent(n_restarts=200)),
+    "blocks": BlockAnnealing(n_chains=64, n_sweeps=50),
+}
+
+
+def lowest(model, replicas=()):
+    """The two lowest energies by enumeration, and the states of the lowest."""
+    exact = enumerated(model)
+    energy, order = exact.energy.sort()
+    return exact, energy[:2], exact.x[order[0]]
+
+
+def sample(sampler, model, seed=0):
+    stream = rng.stream(seed, "negative_phase")
+    return sampler.sample(model, sampler.init(model, 3, generator=stream), None, generator=stream)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+def test_ground_state_is_the_one_of_the_list(make, sampler):
+    model = make()
+    exact, (first, second), x = lowest(model)
+    assert second - first > 1e-3
+    found = at_real_means(model, sample(sampler, model).configurations)
+    states = torch.cat(found[:2], dim=-1)
+    torch.testing.assert_close(states, x.expand_as(states), rtol=0, atol=1e-4)
+    assert len(states) == (2 if exact.variance.any() else 1)
+    energy = model.energy(found.v, found.h)
+    torch.testing.assert_close(energy, first.expand_as(energy), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("sampler", ["annealing", "blocks"])
+@pytest.mark.parametrize(
+    "name", ["Potts RBM", "Potts machine", "mixed RBM", "mixed machine", "real and categories"]
+)
+def test_each_replica_has_its_own(name, sampler):
+    several, one = MODELS[name](replicas=(2, 2)), MODELS[name]()
+    state, own = several.state_dict(), one.state_dict()
+    found = at_real_means(several, sample(SAMPLERS[sampler], several).configurations)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        one.load_state_dict({k: x[i, j] if x.shape != own[k].shape else x for k, x in state.items()})
+        x = lowest(one)[2]
+        states = torch.cat(found[:2], dim=-1)[i, j]
+        torch.testing.assert_close(states, x.expand_as(states), rtol=0, atol=1e-4)
+
+
+def test_rectified_units_have_a_ground_state_by_blocks_alone():
+    model = small_rbm(visible=units.Categorical(3, q=3), hidden=units.ReLU(4)).double()
+    with torch.no_grad():
+        model.c += 1.0
+    v = units.all_states(model.visible, model.b)
+    h = model.hidden_field(v).clamp(min=0)
+    energy = model.energy(v, h)
+    assert (h > 0).any()
+    found = sample(BlockAnnealing(), model).configurations
+    torch.testing.assert_close(found.v[0], v[energy.argmin()])
+    torch.testing.assert_close(found.h[0], h[energy.argmin()])
+
+
+def test_without_the_factor_of_spins_without_constraints_or_integrals_another_state_is_found(monkeypatch):
+    """What must be seen: each of these answers is another one than enumeration's."""
+    solver = SAMPLERS["brute force"]
+
+    def is_missed(name):
+        seen = []
+        for seed in range(3):
+            model = MODELS[name](seed=seed)
+            x = lowest(model)[2]
+            found = at_real_means(model, sample(solver, model).configurations)
+            seen.append(not torch.cat(found[:2], dim=-1)[0].allclose(x, atol=1e-4))
+        return any(seen)
+
+    assert not any(map(is_missed, ("spins", "Potts RBM", "real units")))
+    right = units.Spin.bits
+    with monkeypatch.context() as patch:
+        patch.setattr(units.Spin, "bits", lambda self: right(self)._replace(low=torch.zeros(self.n)))
+        assert is_missed("spins")
+    with monkeypatch.context() as patch:
+        patch.setattr(one_hot, "descend", lambda model, found: found)
+        patch.setattr(one_hot.Constrained, "penalised", lambda self, penalties: self.objective)
+        patch.setattr(one_hot, "safe_penalty", lambda problem: torch.zeros(()))
+        assert is_missed("Potts RBM")
+    with monkeypatch.context() as patch:
+        patch.setattr(units.Gaussian, "mean", lambda self, field: field)
+        patch.setattr(units.Gaussian, "mode", lambda self, field: field)
+        assert is_missed("real units")
+
+
+def test_penalties_leave_most_answers_in_one_state_a_site():
+    """Those of a matrix of one state a site: 12 sites of 21 states, 30 hidden units, in weights of size 0.3."""
+    model = small_rbm(visible=units.Categorical(12, q=21), hidden=units.Bernoulli(30), std=0.3)
+    for solver in (GibbsAnnealing(n_restarts=16), DmmSolver(n_restarts=8, max_steps=2000)):
+        info = sample(GroundState(solver=solver), model).info
+        assert info["feasible_sites"] > 0.8
+        blocks = sample(BlockAnnealing(), model).info["ground_state_energy"]
+        assert info["ground_state_energy"] < 0.97 * blocks
+
+
+def test_a_shift_and_penalties_change_no_energy_of_a_state():
+    model = MODELS["Potts RBM of several sizes"]().double()
+    form, exact = model.in_bits(), enumerated(model)
+    n = model.n_visible
+    y = bits_of(form, Configurations(exact.x[:, :n], exact.x[:, n:]))
+    plain = one_hot.from_bit_form(form)
+    shift, penalties = one_hot._penalties(form, plain, y[:50])
+    problem = one_hot.Constrained.of(
+        one_hot._shifted(plain, form, shift), [one_hot.exactly(1, group) for group in form.groups]
+    )
+    torch.testing.assert_close(problem.penalised(penalties).energy(y), exact.energy, rtol=0, atol=1e-9)
+    assert (penalties > 0).all()
+
+
+def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
+    model = MODELS["mixed RBM"]().double()
+    mode = sample(SAMPLERS["brute force"], model).configurations
+    x = lowest(model)[2]
+    v, h = x.view(1, -1).split((model.n_visible, model.n_hidden), dim=-1)
+    third = torch.tensor([1 / 3] * 3 + [1 / 4] * 4, dtype=torch.float64)
+    free = torch.cat((torch.zeros(2), third, torch.zeros(2)))[None]
+    depth = model.tempered_energy(free, torch.full_like(h, 0.5)) - model.tempered_energy(v, h)
+    expected = depth / (4 * (6 + 1) * (6 + 1))  # six visible sites
+    torch.testing.assert_close(mode_scale(model, mode), expected.squeeze(), check_dtype=False)
+    always = ModeSchedule(n_updates=1, p_max=1.0, delay=-1e3)
+    blocks = ModeAssisted(inner=BlockAnnealing(), mode=BlockAnnealing(), schedule=always)
+    positive = Configurations(v, h)
+    stream = rng.stream(0, "negative_phase")
+    found = blocks.sample(model, blocks.init(model, 1, generator=stream), positive, generator=stream)
+    torch.testing.assert_close(found.info["mode_scale"], expected.squeeze(), check_dtype=False)
