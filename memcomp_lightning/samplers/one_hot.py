@@ -47,10 +47,10 @@ def minimise_in_groups(model: EnergyModel, form: BitForm, solver: QuboSolver, *,
 
     The energy :math:`t_g (\sum_{i \in g} y_i - 1)` of any number t is zero where the constraint of group g holds.
     t is chosen, from states of low energy, halfway between the cost of a second bit and the gain by the one there
-    is: then a small penalty :math:`P_g (\sum y_i - 1)^2` suffices, and it hides the least of the objective. The
-    answers descend class by class in the model, which mends what is left; so do the states that the penalties are
-    read from, and the lowest of all counts. A minimum that the solver proves and that breaks a constraint is sought
-    again with penalties with which that never pays.
+    is: then a small penalty :math:`P_g (\sum y_i - 1)^2` suffices, and it hides the least of the objective.
+    The answers descend class by class in the model, which mends what is left; so do the states that the penalties
+    are read from, and the lowest of all counts. A minimum that the solver proves and that breaks a constraint is
+    sought again with penalties with which that never pays.
     """
     plain = from_bit_form(form)
     guides = _descents(model, generator)

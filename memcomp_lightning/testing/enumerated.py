@@ -79,7 +79,7 @@ def sample_moments(x: Float[Tensor, "n n_units"]) -> tuple[Tensor, Tensor]:
 
     Products that occur a few times only have errors that are not normal: eight occurrences more are allowed for.
     """
-    x, n = x.double(), len(x)
+    x, n = x.detach().double(), len(x)
     first, second = x.mean(0), x.mT @ x / n
     fourth = x.square().mT @ x.square() / n
     mean = torch.cat((first, second.flatten()))

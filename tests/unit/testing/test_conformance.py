@@ -147,7 +147,7 @@ OF_SOLVERS = (
     "RBM of categories and rectified",
     "machine of mixed",
 )
-"""Enough for what calls a solver: their ground states are compared in tests/exact/samplers/test_units_samplers.py."""
+"""Enough for what calls a solver: test_units_samplers.py has the ground states of the others."""
 TRIED = [
     (name, model)
     for name, sampler in OF_EVERY_KIND.items()
