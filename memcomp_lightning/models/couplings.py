@@ -15,7 +15,7 @@ from memcomp_lightning.models.gauge import zero_sum
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Units
 
-N_NODES = 16
+N_NODES = 8
 """Nodes of the Gauss-Hermite rule for the fields of the other sites."""
 
 NUMBERS = 2**22
@@ -179,14 +179,18 @@ def _effective(model: RBM, weight: Tensor, c: Tensor, b: Tensor) -> Couplings:
     of_pairs = weight.new_zeros(*model.replicas, *table, *table)
     of_sites = weight.new_zeros(*model.replicas, *table)
     nodes, rule = _rule(weight)
-    rows = max(1, NUMBERS // (added[..., 0].numel() * n_states**2))
-    for some in torch.arange(n_sites, device=weight.device).split(rows):
-        rest = (spread.sum(-1, keepdim=True) - spread)[..., some].unsqueeze(-1)
-        field = c[..., None, None] + added[..., some, :]
-        of_sites[..., some, :] = _expected(model, field, rest.clamp_min(0.0), nodes, rule)
-        rest = (rest - spread.unsqueeze(-2)).clamp_min(0.0)
-        field = field[..., None, None] + added[..., None, None, :, :]
-        of_pairs[..., some, :, :, :] = _expected(model, field, rest[..., :, None, :, None], nodes, rule)
+    rows = max(1, NUMBERS // (c.numel() * n_states**2))
+    for site in range(n_sites):
+        rest = (spread.sum(-1) - spread[..., site])[..., None, None].clamp_min(0.0)
+        field = c[..., None, None] + added[..., site, None, :]
+        of_sites[..., site : site + 1, :] = _expected(model, field, rest, nodes, rule)
+        # Pairs with the sites before are known: they are the same the other way round.
+        for some in torch.arange(site + 1, n_sites, device=weight.device).split(rows):
+            left = (rest - spread[..., None, some]).clamp_min(0.0)
+            both = field.mT.unsqueeze(-1) + added[..., None, some, :]
+            found = _expected(model, both, left.unsqueeze(-1), nodes, rule)
+            of_pairs[..., site, :, some, :] = found
+            of_pairs[..., some, :, site, :] = found.movedim(-3, -1)
     of_pairs = of_pairs - (of_pairs * share).sum(-1, keepdim=True)
     of_pairs = of_pairs - (of_pairs * share[..., None, None]).sum(-3, keepdim=True)
     of_sites = of_sites - (of_sites * share).sum(-1, keepdim=True)
