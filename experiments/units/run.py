@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 PARTS = ["speed", "mixture", "ising", "ground_states", "sequences"]
-"""Modules beside this file with ``measure(quick=...)``, which returns rows of a table."""
+"""Modules beside this file with ``measure(quick=...)``, which yields the rows of a table."""
 
 HERE = Path(__file__).parent
 
@@ -46,13 +46,15 @@ def main(arguments: list[str] | None = None) -> None:
             continue
         if not given.table:
             begin, spent = time.perf_counter(), time.process_time()
-            rows = importlib.import_module(name).measure(quick=given.quick)
+            rows = list[dict[str, Any]]()
+            for row in importlib.import_module(name).measure(quick=given.quick):
+                rows.append(row)
+                print(row, flush=True)
+                if not given.quick:
+                    write(name, rows)
             minutes, core_hours = (time.perf_counter() - begin) / 60, (time.process_time() - spent) / 3600
             print(f"{name}: {minutes:.1f} minutes, {core_hours:.2f} core hours")
-            if given.quick:
-                continue
-            write(name, rows)
-        if (HERE / f"{name}.csv").exists():
+        if not given.quick and (HERE / f"{name}.csv").exists():
             with (HERE / f"{name}.csv").open(newline="") as file:
                 print(markdown(list(csv.DictReader(file))))
 

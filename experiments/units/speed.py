@@ -1,7 +1,7 @@
 """An epoch with categorical units and with real ones, beside a torch loop written by hand for the same update."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from statistics import median
 from typing import Any, NamedTuple
@@ -188,9 +188,9 @@ def case(units: Units, n_hidden: int, sampler: str, v: Tensor, repeats: int) -> 
     return row | {f"{label}_cpu_s": median(spent) for label, spent in cpu.items()}
 
 
-def measure(*, quick: bool, repeats: int = 7, threads: Iterable[int] = (1, 2)) -> list[dict[str, Any]]:
+def measure(*, quick: bool, repeats: int = 7, threads: Iterable[int] = (1, 2)) -> Iterator[dict[str, Any]]:
     """A row a case, sampler and number of threads."""
-    rows, n_hidden, n_rows = list[dict[str, Any]](), 20 if quick else 200, 200 if quick else 2000
+    n_hidden, n_rows = (20, 200) if quick else (200, 2000)
     before = torch.get_num_threads()
     for n_threads in threads:
         torch.set_num_threads(n_threads)
@@ -200,7 +200,5 @@ def measure(*, quick: bool, repeats: int = 7, threads: Iterable[int] = (1, 2)) -
             for sampler in SAMPLERS:
                 row = {"units": name, "sampler": sampler, "threads": n_threads}
                 row |= case(units, n_hidden, sampler, v, 1 if quick else repeats)
-                rows.append({key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()})
-                print(rows[-1], flush=True)
+                yield {key: round(x, 4) if isinstance(x, float) else x for key, x in row.items()}
     torch.set_num_threads(before)
-    return rows
