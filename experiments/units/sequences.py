@@ -21,8 +21,9 @@ import gzip
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ from memcomp_lightning.samplers import (
     PseudoLikelihood,
 )
 from memcomp_lightning.solvers import GibbsAnnealing
-from memcomp_lightning.training import Boltzmann, Greedy, Phase, PhaseTraining
+from memcomp_lightning.training import L2, Boltzmann, Greedy, Phase, PhaseTraining
 
 FAMILIES = {"kunitz": ALPHABET, "RF00379": RNA}
 IDENTITY = 0.8
@@ -175,18 +176,6 @@ def phase_of(kind: str, units: Categorical, settings: Settings) -> Phase:
     return Greedy(RBM(visible=units, hidden=hidden)).phases[0]
 
 
-def parameters_with(model: Any, l2: float) -> Callable[[Iterable[Tensor]], SGD]:
-    """Makes an optimiser that draws couplings, but no biases, to zero."""
-
-    def make(_: Iterable[Tensor]) -> Any:
-        named = dict(model.named_parameters())
-        couplings = [parameter for name, parameter in named.items() if name in ("weight", "coupling")]
-        others = [parameter for name, parameter in named.items() if name not in ("weight", "coupling")]
-        return [{"params": couplings, "weight_decay": l2}, {"params": others}]
-
-    return make
-
-
 def trained(
     kind: str,
     rows: np.ndarray,
@@ -207,11 +196,11 @@ def trained(
     batches = Batches(
         v, torch.zeros(len(v), dtype=torch.long), settings.batch_size, len(v), shuffle=True, seed=seed
     )
-    groups = parameters_with(model, settings.l2)
     training = PhaseTraining(
         phase,
         sampler_of(settings),
-        optimizer=lambda parameters: SGD(groups(parameters), lr=settings.rate),
+        optimizer=partial(SGD, lr=settings.rate),
+        penalties=[L2(settings.l2)] if settings.l2 else [],
         centring=None if settings.centring is None else Centring(rate=settings.centring),
         streams=rng.streams(seed, ("negative_phase", "positive_phase")),
     )
