@@ -38,6 +38,8 @@ class Block(NamedTuple):
         weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
         bias: ``(*replicas, n_class)``.
         kind: What the units are.
+        of_all: The same couplings with a column for each unit of the model, ``(*replicas, n_class, n_units)``;
+            None where neighbours are few beside all others.
     """
 
     units: Tensor
@@ -45,9 +47,12 @@ class Block(NamedTuple):
     weight: Tensor
     bias: Tensor
     kind: Units
+    of_all: Tensor | None = None
 
     def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
         """Field of each unit given all others: the log odds of units in {0, 1}."""
+        if self.of_all is not None:
+            return affine(x, self.of_all, self.bias)  # to gather values would take longer than to multiply them
         return affine(x[..., self.neighbours], self.weight, self.bias)
 
 

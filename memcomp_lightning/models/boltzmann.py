@@ -37,6 +37,9 @@ class _Layout(NamedTuple):
 
 _INDICES = ("units", "neighbours", "edge", "slot")
 
+_DENSE = 0.5
+"""Share of all pairs of units from which on couplings stand in a matrix of all units, not in one for each class."""
+
 
 class BoltzmannMachine(Machine):
     r"""A model of data v with hidden units h: x = (v, h), with couplings between any pairs.
@@ -132,6 +135,8 @@ class BoltzmannMachine(Machine):
         # Without parameters of their own they stay as they are, and are not made anew at each sweep.
         changing = any(buffer.is_floating_point() for kind in kinds for buffer in kind.buffers())
         self._kinds = None if changing else nn.ModuleList(kinds)
+        # Of two classes the blocks are halves of such a matrix already.
+        self._dense = len(classes) > 2 and 2 * len(pairs) >= _DENSE * n_units * (n_units - 1)
         self._n_forward: list[int] = []
         for number, layout in enumerate(_layouts(n_units, pairs, classes)):
             self._n_forward.append(layout.n_forward)
@@ -192,10 +197,22 @@ class BoltzmannMachine(Machine):
         kinds: Iterable[Any] = self._kinds or [
             _kind_of(self.visible, self.hidden, layout.units) for layout in layouts
         ]
+        matrix = self._matrix() if self._dense else None
         for (units, neighbours, edge, slot, _), kind in zip(layouts, kinds, strict=True):
+            if matrix is not None:
+                of_all = matrix[..., units, :]
+                weight = of_all[..., neighbours]
+                found.append(Block(units, neighbours, weight, bias[..., units], kind, of_all))
+                continue
             weight = self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
             found.append(Block(units, neighbours, weight, bias[..., units], kind))
         return found
+
+    def _matrix(self) -> Tensor:
+        """The couplings of all units to all units, ``(*replicas, n_units, n_units)``."""
+        first, second = self.pairs.unbind(-1)
+        upper = self._placed((self.n_units, self.n_units), first * self.n_units + second, self.coupling)
+        return upper + upper.mT
 
     def _placed(self, shape: tuple[int, int], at: Tensor, coupling: Tensor) -> Tensor:
         """Couplings at these places of a flat matrix of zeros, as a matrix."""
@@ -278,8 +295,23 @@ class BoltzmannMachine(Machine):
         of_units = of_units.index_add(-1, first, of_pairs * offset[..., second], alpha=-1)
         return of_pairs, of_units.index_add(-1, second, of_pairs * offset[..., first], alpha=-1)
 
+    def _plain_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        of_pairs, of_units = centred
+        offset = torch.cat((visible_offset, hidden_offset), dim=-1)
+        first, second = self.pairs[:, 0], self.pairs[:, 1]
+        of_units = of_units.index_add(-1, first, of_pairs * offset[..., second])
+        of_units = of_units.index_add(-1, second, of_pairs * offset[..., first])
+        across = offset[..., first] * of_units[..., second] + offset[..., second] * of_units[..., first]
+        return of_pairs + across, of_units
+
     def _sums(self, x: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
         """Sums over configurations of the product of each pair and of each unit."""
+        if self._dense:
+            products = (x.mT @ weighted).flatten(-2)
+            at = self.pairs[:, 0] * self.n_units + self.pairs[:, 1]
+            return products[..., at], weighted.sum(-2)
         of_pairs = torch.empty_like(self.coupling)
         for units, neighbours, edge, slot, n in self._layouts():
             if n:

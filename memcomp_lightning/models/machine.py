@@ -110,8 +110,9 @@ class Machine(nn.Module):
         :math:`b = b' + \gamma \mu` with it.
         """
         with torch.no_grad():
-            value = self.total_energy(v, h, weight)
             moments = self._centred_moments(v, h, weight, visible_offset, hidden_offset)
+            plain = self._plain_moments(moments, visible_offset, hidden_offset)
+            value = self._energy_of(plain) + self._of_measures(v, h, weight)
         surrogate = self._energy_of(moments)
         curvature = self.visible.curvature
         if curvature is not None and curvature.requires_grad:
@@ -139,6 +140,12 @@ class Machine(nn.Module):
         self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
     ) -> Sequence[Tensor]:
         """The same sums of the centred parametrisation, turned into those of the model's own parameters."""
+
+    @abstractmethod
+    def _plain_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
+    ) -> Sequence[Tensor]:
+        """What :meth:`_moments` gives, from the centred ones of weights that add up to 0: no sums over rows."""
 
     @abstractmethod
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:

@@ -103,11 +103,14 @@ def _among(units: Tensor, n_visible: int, clamped: str) -> Tensor:
 
 def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
     """The free units of each class, without the classes that have none."""
-    found = []
+    found: list[Block] = []
+    if not (model.n_hidden if clamped == "visible" else model.n_visible):
+        return found
     for block in model.blocks():
         keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
         if len(keep):
             weight, bias = block.weight.index_select(-2, keep), block.bias.index_select(-1, keep)
-            kind = block.kind.select(keep)
-            found.append(block._replace(units=block.units[keep], weight=weight, bias=bias, kind=kind))
+            of_all = None if block.of_all is None else block.of_all.index_select(-2, keep)
+            parts = {"units": block.units[keep], "weight": weight, "bias": bias, "of_all": of_all}
+            found.append(block._replace(kind=block.kind.select(keep), **parts))
     return found

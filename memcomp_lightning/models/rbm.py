@@ -98,6 +98,15 @@ class RBM(Machine):
         of_c = weighted_h.sum(-2) - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
         return of_weight, of_b, of_c
 
+    def _plain_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        of_weight, of_b, of_c = centred
+        of_b = of_b + (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
+        of_c = of_c + (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
+        left = torch.stack((hidden_offset, of_c), dim=-1)
+        return of_weight + left @ torch.stack((of_b, visible_offset), dim=-2), of_b, of_c
+
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
         of_weight, of_b, of_c = moments
         coupled: Tensor = vecdot(self.weight.flatten(-2), of_weight.flatten(-2))
