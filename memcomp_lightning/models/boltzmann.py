@@ -38,7 +38,7 @@ class _Layout(NamedTuple):
 _INDICES = ("units", "neighbours", "edge", "slot")
 
 _DENSE = 0.5
-"""Share of all pairs of units from which on couplings stand in a matrix of all units, not in one for each class."""
+"""Share of all pairs of units from which on couplings stand in one matrix, not in one for each class."""
 
 
 class BoltzmannMachine(Machine):

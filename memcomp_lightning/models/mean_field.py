@@ -111,6 +111,6 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
         if len(keep):
             weight, bias = block.weight.index_select(-2, keep), block.bias.index_select(-1, keep)
             of_all = None if block.of_all is None else block.of_all.index_select(-2, keep)
-            parts = {"units": block.units[keep], "weight": weight, "bias": bias, "of_all": of_all}
-            found.append(block._replace(kind=block.kind.select(keep), **parts))
+            kind = block.kind.select(keep)
+            found.append(Block(block.units[keep], block.neighbours, weight, bias, kind, of_all))
     return found
