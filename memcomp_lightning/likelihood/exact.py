@@ -67,6 +67,8 @@ def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 
         SettingError: As :func:`log_partition_function`.
     """
     require_count("n", n)
+    remedy = "Of a machine of two classes take as_two_layers(model).rbm, whose visible units are the first class."
+    require(isinstance(model, RBM), "model", type(model).__name__, "an RBM", remedy)
     binary = in_bits(model)
     if binary is None:
         return _samples_by_cumulants(model, n, generator, min(max_units, 20))

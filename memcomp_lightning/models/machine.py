@@ -119,7 +119,7 @@ class Machine(nn.Module):
             with torch.no_grad():
                 centred = v - visible_offset.unsqueeze(-2)
                 squares = 0.5 * (weight.unsqueeze(-2) @ centred.square()).squeeze(-2)
-                along = _learned(self.visible).to(squares.device) * visible_offset * squares
+                along = _learned(self.visible, squares.device) * visible_offset * squares
             surrogate = surrogate + vecdot(curvature, squares) + vecdot(self.b, along)
         return value + (surrogate - surrogate.detach())
 
@@ -152,12 +152,13 @@ class Machine(nn.Module):
         """Minus the sum over the parameters of each one times its moment, ``(*replicas,)``."""
 
 
-def _learned(units: Units) -> Tensor:
+def _learned(units: Units, device: torch.device) -> Tensor:
     """Which entries have a precision that training changes, ``(n,)``."""
     if isinstance(units, Mixed):
-        return torch.cat([_learned(kind) for kind in units.kinds])
+        return torch.cat([_learned(kind, device) for kind in units.kinds])
     curvature = units.curvature
-    return torch.full((units.n,), curvature is not None and curvature.requires_grad, dtype=torch.bool)
+    is_learned = curvature is not None and curvature.requires_grad
+    return torch.full((units.n,), is_learned, dtype=torch.bool, device=device)
 
 
 def units_of(layer: str, n: int | None, units: Units | None) -> Units:

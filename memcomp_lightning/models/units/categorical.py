@@ -53,8 +53,10 @@ class Categorical(Units):
         self._site: Tensor
         self._begin: Tensor
         self._slot: Tensor
+        self._sizes: Tensor
         self.register_buffer("_site", sites, persistent=False)
         self.register_buffer("_begin", begins, persistent=False)
+        self.register_buffer("_sizes", torch.tensor(sizes, dtype=torch.long), persistent=False)
         # Where each entry goes in a table (n_sites, widest) with empty places.
         slot = sites * widest + torch.arange(self.n) - begins[sites] if sizes else sites
         self.register_buffer("_slot", slot, persistent=False)
@@ -109,11 +111,11 @@ class Categorical(Units):
         u = rng.uniform(share.shape[:-1], generator=generator, like=like) * below[..., -1]
         # The first state whose sum is above u: a state of share zero is never drawn.
         index = torch.searchsorted(below, u.unsqueeze(-1), right=True).squeeze(-1)
-        last = share.shape[-1] - 1 if self._q is not None else self._last(like)
-        return self._one_hot(index.clamp_(max=last) if isinstance(last, int) else index.minimum(last), like)
+        return self._one_hot(index.minimum(self._last(like)), like)
 
     def _last(self, like: Tensor) -> Tensor:
-        return torch.tensor(self.sizes, device=like.device) - 1
+        """Number of the last state of each site, on the device of the data."""
+        return self._sizes.to(like.device) - 1
 
     def mode(self, field: Values) -> Values:
         """The state of the largest field."""
@@ -154,11 +156,11 @@ class Categorical(Units):
 
     def zero_sum(self, x: Values) -> Values:
         """Entries less their mean over the states of their site."""
-        return x - self.over_sites(self.site_sums(x) / torch.tensor(self.sizes, device=x.device))
+        return x - self.over_sites(self.site_sums(x) / self._sizes)
 
     def from_intensity(self, v: PerSite) -> Tensor:
         """Numbers of states: levels of grey from 0, black, to q - 1, white; a byte each where that is enough."""
-        numbers = (v * (torch.tensor(self.sizes, device=v.device) - 1)).round()
+        numbers = (v * self._last(v)).round()
         return numbers.to(torch.uint8 if self._widest <= 256 else torch.long)
 
     def to_intensity(self, x: Values) -> PerSite:
@@ -178,7 +180,7 @@ class Categorical(Units):
         fits = states.ndim >= 1 and states.shape[-1] == self.n_sites
         require(fits, "shape of states", tuple(states.shape), f"(..., {self.n_sites})")
         index = states.long()
-        wrong = (index < 0) | (index > self._last(states)) | (index != states)
+        wrong = (index < 0) | (index >= self._sizes) | (index != states)
         if bool(wrong.any()):
             place = wrong.nonzero()[0].tolist()
             size = self.sizes[place[-1]]

@@ -189,6 +189,11 @@ def test_exact_samples_are_those_of_the_model(name):
     check_samples(name)
 
 
+def test_samples_of_a_machine_are_refused():
+    with pytest.raises(SettingError, match=r"model = 'DBM' is not allowed: expected an RBM.*as_two_layers"):
+        exact_samples(MACHINES["DBM of spins"](), 3, generator=rng.stream(0, "samples"))
+
+
 # --- annealing --------------------------------------------------------------------------------------------
 
 

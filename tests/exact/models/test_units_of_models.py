@@ -504,14 +504,14 @@ MUTANTS = {
     "centred: a fixed precision moves": (
         machine,
         "_learned",
-        lambda right: lambda units: torch.ones(units.n, dtype=torch.bool),
+        lambda right: lambda units, device: torch.ones(units.n, dtype=torch.bool),
         check_centred,
         "mixed x bits",
     ),
     "centred: biases stand still": (
         machine,
         "_learned",
-        lambda right: lambda units: torch.zeros(units.n, dtype=torch.bool),
+        lambda right: lambda units, device: torch.zeros(units.n, dtype=torch.bool),
         check_centred,
         "real x bits",
     ),
