@@ -241,6 +241,6 @@ def _need_no_shift(field: Tensor) -> bool:
     """Whether exp(field) is far from overflow and zero; asked on the CPU alone, as other devices would wait."""
     if field.device.type != "cpu" or not field.numel():
         return False
-    low, high = torch.aminmax(field)
+    low, high = torch.aminmax(field.detach())
     # Of NaN and of infinite fields this is False.
     return float(torch.maximum(-low, high)) < math.log(torch.finfo(field.dtype).max) / 2
