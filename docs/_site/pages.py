@@ -64,6 +64,7 @@ GROUP_TEXTS = {
     "solver": "What looks for ground states of the QUBO, of the samplers that need one and of `memcomp-solve`.",
     "solver/field": "The equations of the DMM; [the DMM](../dmm.md).",
     "trainer": "Lightning's trainer.",
+    "units": "What the visible units are, and how grey values become their values; [units](../units.md).",
     "worth": "Comparisons by likelihood; the experiments of that name choose them.",
 }
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, model_of, tensorboards, write_picture
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.plotting.rendering import rendered
 from memcomp_lightning.plotting.trajectory import plot_trajectory
 from memcomp_lightning.problems import Qubo, from_model
@@ -19,8 +19,8 @@ class TrajectoryFigure(EveryIterations):
     The picture is that of Manukian et al. 2019, Fig. 2, by :func:`memcomp_lightning.plotting.plot_trajectory`. The
     machine has a random stream of its own and the same start each time, so that pictures compare, and runs on the
     CPU; training does not see it. Spins are written in bits, real units are integrated out; of categories, whose
-    machine repeats until their constraints hold, there is no one trajectory, and no picture. A large model costs
-    seconds a picture; without TensorBoard nothing is solved.
+    machine repeats until their constraints hold, there is no one trajectory, and no picture, nor is there of units
+    without a form in bits. A large model costs seconds a picture; without TensorBoard nothing is solved.
 
     Args:
         every: Passes between two pictures, >= 1.
@@ -44,10 +44,15 @@ class TrajectoryFigure(EveryIterations):
         if not tensorboards(trainer):
             return
         model = model_of(pl_module)
-        if any(units.n and units.bits().groups for units in (model.visible, model.hidden)):
+        try:
+            constrained = any(units.n and units.bits().groups for units in (model.visible, model.hidden))
+            problem = _first(from_model(model))
+        except SettingError as error:
+            self.leave_out(str(error))
+            return
+        if constrained:
             self.leave_out("the ground state of categories is found by several runs of the machine")
             return
-        problem = _first(from_model(model))
         solution = self.solver.minimise(problem, generator=rng.stream(self.seed, "trajectory"))
         if not isinstance(solution.trajectory, Trajectory):
             raise TypeError(f"{type(self.solver).__name__} returned no trajectory for TrajectoryFigure to draw.")

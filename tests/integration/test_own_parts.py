@@ -106,6 +106,26 @@ def test_images_of_ones_own_from_the_page(
     assert "test accuracy" in outcome.out
 
 
+def test_a_kind_of_units_of_ones_own_from_the_page(
+    memcomp_train: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "(Units)" in block]
+    (config,) = re.findall(r"ternary.yaml` with\n\n(.*?)\n\n", page, flags=re.DOTALL)
+    (tmp_path / "ternary_units.py").write_text(code.partition("check_units(")[0])
+    (tmp_path / "confs/units").mkdir(parents=True)
+    (tmp_path / "confs/units/ternary.yaml").write_text(dedent(config).replace("your_package", "ternary_units"))
+    monkeypatch.syspath_prepend(tmp_path)
+    run = ["--config-dir=confs", "units=ternary", "data=shifting_bars", "model.hidden_sizes=[4]", *FAST]
+    outcome = memcomp_train(*run, "sampler=exact", "callbacks=diagnostics_exact", "logger=tensorboard")
+    assert outcome.status == 0, outcome.err
+    assert "test accuracy" in outcome.out
+    assert "TrajectoryFigure is left out" in outcome.out
+    refused = memcomp_train(*run, "sampler=dmm_qubo")
+    assert refused.status == 2
+    assert "units = 'Ternary' is not allowed: expected units with a form in bits" in refused.err
+
+
 def test_a_missing_weight_file_is_trained_again_and_a_damaged_record_is_named(memcomp_train: Run) -> None:
     run = ["sampler=cd", *FAST, "callbacks=minimal", "hydra.run.dir=run"]
     assert memcomp_train(*run).status == 0
