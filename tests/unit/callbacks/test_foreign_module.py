@@ -12,10 +12,12 @@ from lightning.pytorch.loggers import CSVLogger
 from memcomp_lightning.callbacks import (
     ChainPictures,
     ClassificationMetrics,
+    Densities,
     EnergyHistograms,
     FreeEnergyGap,
     GradientBias,
     HyperParameters,
+    Logos,
     ModelSamples,
     NegativePhaseEnergies,
     OptimizerMonitor,
@@ -27,6 +29,8 @@ from memcomp_lightning.callbacks import (
     Schedules,
     StageProgressBar,
     StageTimes,
+    StateFrequencies,
+    StateWeights,
     TrajectoryFigure,
 )
 from memcomp_lightning.callbacks.base import model_of
@@ -47,6 +51,10 @@ def all_callbacks() -> list[pl.Callback]:
         ReceptiveFields(every=1, n_units=4),
         ModelSamples(every=1, n_samples=4, n_sweeps=3),
         ChainPictures(every=1, n_chains=4),
+        StateFrequencies(every=1, n_samples=4, n_sweeps=3),
+        StateWeights(every=1),
+        Logos(every=1, n_samples=4, n_sweeps=3),
+        Densities(every=1, n_samples=4, n_sweeps=3),
         TrajectoryFigure(every=1),
         SaturationGuard(),
         ClassificationMetrics(),

@@ -15,7 +15,7 @@ from memcomp_lightning.errors import SettingError
 CONF = Path(__file__).parents[3] / "conf"
 OPTIONS = [
     f"{group}={path.stem}"
-    for group in ("sampler", "solver", "positive", "pretrain", "model", "data")
+    for group in ("sampler", "solver", "positive", "pretrain", "model", "data", "units")
     for path in sorted((CONF / group).glob("*.yaml"))
 ]
 NUMBER_OR_WORD = {"sampler.beta"}
