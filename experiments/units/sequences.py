@@ -21,7 +21,7 @@ import gzip
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from site_statistics import ALPHABET, RNA, compare, one_site
+from site_statistics import ALPHABET, N_STATES, RNA, compare, one_site
 from torch import Tensor
 from torch.optim import SGD
 
@@ -274,47 +274,84 @@ def independent(rows: np.ndarray, n_states: int, n: int, seed: int = 0) -> np.nd
     return (below <= u * below[:, -1:]).sum(-1)
 
 
+MEASURES = ("one_site_pearson", "one_site_rms", "two_site_pearson", "two_site_slope", "two_site_rms")
+
+
+def row_of(name: str, found: dict[str, float], prefix: str = "") -> dict[str, Any]:
+    """A row of the table of statistics."""
+    return {"samples": name} | {measure: f"{found[prefix + measure]:.4f}" for measure in MEASURES}
+
+
+def bounds(rows: np.ndarray, held_out: np.ndarray, n_states: int) -> list[dict[str, Any]]:
+    """What training rows themselves reach, and what models without couplings do."""
+    floor = compare(independent(rows, n_states, 10_000), held_out, rows, n_states)
+    return [row_of("training rows (ceiling)", floor, "ceiling_"), row_of("independent sites (floor)", floor)]
+
+
+def spent(report: dict[str, Any]) -> dict[str, Any]:
+    """What a training and its samples took, as columns of a table."""
+    seconds = {what: round(report[f"cpu_seconds_{what}"]) for what in ("training", "sampling")}
+    return {
+        "updates": report["updates"],
+        "s of training": seconds["training"],
+        "s of sampling": seconds["sampling"],
+    }
+
+
 def judge(given: argparse.Namespace) -> None:
     train_name, test_name = ("fit", "validation") if given.validation else ("train", "test")
     rows, alphabet = load(given.folder / f"{train_name}.npz")
     held_out, _ = load(given.folder / f"{test_name}.npz")
     q = len(alphabet)
-    measures = ("one_site_pearson", "one_site_rms", "two_site_pearson", "two_site_slope", "two_site_rms")
-    print("| samples | " + " | ".join(measures) + " | distinct | updates | s of training | s of sampling |")
-    print("| --- " * (len(measures) + 5) + "|")
-    floor = independent(rows, q, 10_000)
-    ceiling = {
-        name: value for name, value in compare(floor, held_out, rows, q).items() if name.startswith("ceiling_")
-    }
-    line(
-        "training rows (ceiling)",
-        {name.removeprefix("ceiling_"): value for name, value in ceiling.items()},
-        measures,
-    )
-    line("independent sites (floor)", compare(floor, held_out, rows, q), measures)
+    table = bounds(rows, held_out, q)
     for path in given.samples:
-        samples, _ = load(path)
-        report = json.loads(path.with_suffix(".json").read_text())
-        line(path.stem, compare(samples, held_out, rows, q), measures, report, len(np.unique(samples, axis=0)))
+        with np.load(path) as file:
+            report = json.loads(path.with_suffix(".json").read_text())
+            kinds = ("indices", "chains") if given.chains and "chains" in file else ("indices",)
+            for kind in kinds:
+                name = path.stem if kind == "indices" else f"{path.stem}, training's chains"
+                found = row_of(name, compare(file[kind], held_out, rows, q))
+                table.append(found | {"distinct": len(np.unique(file[kind], axis=0))} | spent(report))
+    columns = list(dict.fromkeys(column for row in table for column in row))
+    print("| " + " | ".join(columns) + " |")
+    print("|" + " --- |" * len(columns))
+    for row in table:
+        print("| " + " | ".join(str(row.get(column, "")) for column in columns) + " |")
 
 
-def line(
-    name: str,
-    found: dict[str, float],
-    measures: Sequence[str],
-    report: dict[str, Any] | None = None,
-    distinct: int | None = None,
-) -> None:
-    cells = [name, *(f"{found[measure]:.4f}" for measure in measures), "" if distinct is None else str(distinct)]
-    if report:
-        cells += [
-            str(report["updates"]),
-            f"{report['cpu_seconds_training']:.0f}",
-            f"{report['cpu_seconds_sampling']:.0f}",
-        ]
-    else:
-        cells += [""] * 3
-    print("| " + " | ".join(cells) + " |", flush=True)
+def measure(*, quick: bool = False) -> Iterator[dict[str, Any]]:
+    """Our rows of the table of the page, for run.py: statistics of 10,000 samples, and nats a held-out row."""
+    path = Path(os.environ["MEMCOMP_DATA_DIR"]) / "sequences" / "kunitz.fasta.gz"
+    rows = read_fasta(path, ALPHABET)
+    found = parts(rows[:300] if quick else rows, N_STATES)
+    fit, held_out = found["train"], found["test"]
+    yield from bounds(fit, held_out, N_STATES)
+    ends = {"updates": 2} if quick else {"seconds": 120.0}
+    for name, (kind, settings) in MODELS.items():
+        model, _, report = trained(kind, fit, N_STATES, settings, **ends)
+        clock = Clock()
+        v = sampled(model, 20 if quick else 10_000, 2 if quick else 100)
+        report |= clock.report("sampling")
+        samples = model.visible.decode(v).numpy()
+        row = row_of(name, compare(samples, held_out, fit, N_STATES))
+        row |= {"distinct": len(np.unique(samples, axis=0))} | spent(report) | {"valid": valid(model.visible, v)}
+        nats = nats_of(
+            model,
+            fit,
+            held_out[:20] if quick else held_out,
+            n_chains=10 if quick else 100,
+            n_betas=20 if quick else 1000,
+        )
+        yield row | {
+            name: value for name, value in nats.items() if name in ("pseudo, held out", "log p, held out")
+        }
+
+
+MODELS = {
+    "RBM, PCD": ("rbm", Settings(rate=0.1)),
+    "Potts, PCD": ("potts", Settings(rate=0.1)),
+    "Potts, pseudo-likelihood": ("potts", Settings(rate=0.1, sampler="pseudo", centring=None, l2=0.01)),
+}
 
 
 def model_of(path: Path, n_sites: int, n_states: int) -> Any:
@@ -324,28 +361,35 @@ def model_of(path: Path, n_sites: int, n_states: int) -> Any:
     return model
 
 
+def nats_of(model: Any, rows: np.ndarray, held_out: np.ndarray, *, n_chains: int, n_betas: int) -> dict[str, Any]:
+    """Mean nats a row: the pseudo-likelihood, and for RBMs the likelihood, log Z by annealing."""
+    units = model.visible
+    v, test = units.encode(torch.as_tensor(rows)), units.encode(torch.as_tensor(held_out))
+    some = {"held out": test, "training": v[:: max(1, len(v) // 1000)]}
+    found: dict[str, Any] = {
+        f"pseudo, {name}": round(float(log_pseudo_likelihood(model, rows).sum(-1).mean()), 2)
+        for name, rows in some.items()
+    }
+    if isinstance(model, RBM):
+        ais = Ais(n_chains=n_chains, n_betas=n_betas)
+        log_z = ais.estimate(model, generator=rng.stream(0, "ais"), base=base_of(v, units))
+        found["log Z"] = str(log_z)
+        for name, rows in some.items():
+            found[f"log p, {name}"] = round(float(log_likelihood(model, rows, log_z.log_z).mean()), 2)
+    return found
+
+
 def likelihoods(given: argparse.Namespace) -> None:
-    """Nats a held-out row: pseudo-likelihood, and for RBMs the likelihood by annealing."""
     rows, alphabet = load(given.folder / "train.npz")
     held_out, _ = load(given.folder / "test.npz")
     units = Categorical(rows.shape[1], q=len(alphabet))
-    v, test = units.encode(torch.as_tensor(rows)), units.encode(torch.as_tensor(held_out))
-    base = base_of(v, units)
-    field = base.double()
-    alone = float((test.double() @ field).mean() - units.cumulant(field).sum())
-    print("independent sites", round(alone, 2))
+    field = base_of(units.encode(torch.as_tensor(rows)), units).double()
+    alone = (units.encode(torch.as_tensor(held_out)).double() @ field).mean() - units.cumulant(field).sum()
+    print(json.dumps({"model": "independent sites", "log p, held out": round(float(alone), 2)}))
     for path in given.models:
         model, clock = model_of(path, rows.shape[1], len(alphabet)), Clock()
-        found: dict[str, Any] = {"model": path.stem}
-        for name, some in (("test", test), ("train", v[:: max(1, len(v) // 1000)])):
-            found[f"pseudo_{name}"] = float(log_pseudo_likelihood(model, some).sum(-1).mean())
-        if isinstance(model, RBM):
-            ais = Ais(n_chains=given.chains, n_betas=given.betas)
-            log_z = ais.estimate(model, generator=rng.stream(0, "ais"), base=base)
-            found["log_z"] = str(log_z)
-            for name, some in (("test", test), ("train", v)):
-                found[name] = float(log_likelihood(model, some, log_z.log_z).mean())
-        print(json.dumps(found | clock.report("judging")), flush=True)
+        found = nats_of(model, rows, held_out, n_chains=given.chains, n_betas=given.betas)
+        print(json.dumps({"model": path.stem} | found | clock.report("judging")), flush=True)
 
 
 def arguments(given: Sequence[str] | None) -> argparse.Namespace:
@@ -371,6 +415,7 @@ def arguments(given: Sequence[str] | None) -> argparse.Namespace:
     one.add_argument("folder", type=Path)
     one.add_argument("--samples", type=Path, nargs="*", default=[])
     one.add_argument("--validation", action="store_true", help="of validation.npz beside fit.npz")
+    one.add_argument("--chains", action="store_true", help="the persistent chains at the end of training, too")
     one.set_defaults(run=judge)
     one = commands.add_parser("likelihood", help="nats a held-out row")
     one.add_argument("folder", type=Path)

@@ -80,8 +80,8 @@ def test_samples_are_sequences(folder, model, settings, capsys):
         ["likelihood", str(folder), "--models", str(out.with_suffix(".pt")), "--chains", "5", "--betas", "20"]
     )
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert found["pseudo_test"] < 0
-    assert ("log_z" in found) == (model == "rbm")
+    assert found["pseudo, held out"] < 0
+    assert ("log Z" in found) == (model == "rbm")
 
 
 def test_independent_sites_have_the_frequencies_of_the_rows():
