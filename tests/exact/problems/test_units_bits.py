@@ -26,7 +26,7 @@ from memcomp_lightning.testing import (
 from memcomp_lightning.types import Configurations
 
 V, H = visible_kinds(), {name: kind for name, kind in hidden_kinds().items() if not kind.real}
-REAL_HIDDEN = units.Gaussian(3, variance=torch.tensor([0.5, 1.0, 2.0]))
+REAL_HIDDEN = units.Gaussian(3, variance=torch.tensor([0.5, 1.0, 2.0]), learned=False)
 MAKERS = (
     {f"RBM of {v} and {h}": partial(small_rbm, visible=V[v], hidden=H[h]) for v in V for h in H}
     | {f"machine of {v} and {h}": partial(small_machine, visible=V[v], hidden=H[h]) for v in V for h in ("spins",)}
