@@ -32,8 +32,9 @@ class Answers(NamedTuple):
     Attributes:
         solution: Answers that keep all constraints: those of the solver, descended.
         best: The lowest configuration of all, one a replica, ``(*replicas, 1, n)``.
-        info: ``feasible_sites``, the share of the groups that the solver's own answers have one bit in;
-            ``gain_over_descents``, how far its best answer is below the best descent from a random state.
+        info: ``ground_state_energy``, that of ``best``; ``feasible_sites``, the share of the groups that the
+            solver's own answers have one bit in; ``gain_over_descents``, how far its best answer is below the best
+            descent from a random state.
     """
 
     solution: QuboSolution
@@ -76,8 +77,13 @@ def minimise_in_groups(model: EnergyModel, form: BitForm, solver: QuboSolver, *,
     lowest = torch.cat((energies, of_guides), dim=-1).argmin(-1)[..., None, None]
     best = Configurations(*(x.take_along_dim(lowest, dim=-2) for x in states))
     share = (broken * was_run).sum(-1) / (was_run.sum(-1) * len(form.groups))
-    gain = of_guides.amin(-1) - energies.amin(-1)
-    return Answers(descended, best, {"feasible_sites": 1 - share.float(), "gain_over_descents": gain})
+    of_solver, of_descents = energies.amin(-1), of_guides.amin(-1)
+    info = {
+        "ground_state_energy": torch.minimum(of_solver, of_descents),
+        "feasible_sites": 1 - share.float(),
+        "gain_over_descents": of_descents - of_solver,
+    }
+    return Answers(descended, best, info)
 
 
 def bits_of(form: BitForm, configurations: Configurations) -> Float[Tensor, "*replicas n n_bits"]:
