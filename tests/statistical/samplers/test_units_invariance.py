@@ -1,4 +1,4 @@
-"""Chains that begin in the exact distribution of a model stay there, whatever its units: no mixing is asked for."""
+"""Chains that begin in the exact distribution of a model stay there, whatever its units. It needs no mixing."""
 
 import pytest
 import torch
