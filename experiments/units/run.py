@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 PARTS = ["speed", "mixture", "ising", "ground_states", "sequences"]
-"""Modules beside this file with ``measure(quick=...)``, which yields the rows of a table."""
+"""Modules beside this file with ``measure(quick=...)``, which yields the rows of a table,
+or with commands of their own."""
 
 HERE = Path(__file__).parent
 
@@ -47,7 +48,11 @@ def main(arguments: list[str] | None = None) -> None:
         if not given.table:
             begin, spent = time.perf_counter(), time.process_time()
             rows = list[dict[str, Any]]()
-            for row in importlib.import_module(name).measure(quick=given.quick):
+            module = importlib.import_module(name)
+            if not hasattr(module, "measure"):
+                print(f"{name}: {module.__doc__}")
+                continue
+            for row in module.measure(quick=given.quick):
                 rows.append(row)
                 print(row, flush=True)
                 if not given.quick:
