@@ -404,10 +404,14 @@ def api_page(module: str) -> str:
     parts = [f"# {module}", f"::: {PACKAGE}.{module}\n" + indented("members: []", "show_root_heading: false")]
     exported_names = public_names(module)
     parts += [f"::: {path}" for _, path in exported_names]
-    said = {name for name, _ in exported_names}
-    if (ROOT / PACKAGE / module / "__init__.py").exists():
+    init = ROOT / PACKAGE / module / "__init__.py"
+    if init.exists():
+        # By where it is defined: two modules may have something of one name, of which one is exported.
+        imports = [node for node in ast.walk(ast.parse(init.read_text())) if isinstance(node, ast.ImportFrom)]
+        said = {(node.module, alias.name) for node in imports for alias in node.names}
+        said |= {(path.rpartition(".")[0], name) for name, path in exported_names}
         for path in modules(module):
-            further = [name for name in defined(path) if name not in said]
+            further = [name for name in defined(path) if (dotted(path), name) not in said]
             if further:
                 parts.append(f"## In `{path.relative_to(ROOT / PACKAGE).as_posix()}`")
                 parts += [f"::: {dotted(path)}.{name}\n" + indented("heading_level: 3") for name in further]
