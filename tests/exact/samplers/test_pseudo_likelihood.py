@@ -162,7 +162,7 @@ HIDDEN = {
     "bits": lambda: Bernoulli(3),
     "spins": lambda: Spin(2),
     "categories": lambda: Categorical([3, 2]),
-    "real": lambda: Gaussian(2, variance=0.7),
+    "real": lambda: Gaussian(2, variance=0.7, learned=False),
 }
 
 
