@@ -93,11 +93,11 @@ def _sites_of(model: EnergyModel, device: torch.device) -> _Sites:
     widest = max((len(site) for site in sites), default=1)
     n_states = max([widest] * bool(bits.groups) + [2] * bool(alone), default=1)
     at, low, width = bits.at.cpu(), bits.low.double().cpu(), bits.width.double().cpu()
-    entries = torch.zeros(len(sites), widest, dtype=torch.long)
-    values = torch.zeros(len(sites), n_states, widest, dtype=torch.float64)
-    exists = torch.zeros(len(sites), n_states, dtype=torch.bool)
+    entries = torch.zeros(len(sites), widest, dtype=torch.long, device="cpu")
+    values = torch.zeros(len(sites), n_states, widest, dtype=torch.float64, device="cpu")
+    exists = torch.zeros(len(sites), n_states, dtype=torch.bool, device="cpu")
     for number, site in enumerate(sites):
-        some = torch.tensor(site)
+        some = torch.tensor(site, device="cpu")
         entries[number] = at[some[0]]
         entries[number, : len(site)] = at[some]
         if site[0] in grouped:
@@ -106,7 +106,7 @@ def _sites_of(model: EnergyModel, device: torch.device) -> _Sites:
         else:
             values[number, 0, 0], values[number, 1, 0] = low[some[0]], low[some[0]] + width[some[0]]
             exists[number, :2] = True
-    real = torch.tensor(sorted(set(range(units.n)) - set(at.tolist())), dtype=torch.long)
+    real = torch.tensor(sorted(set(range(units.n)) - set(at.tolist())), dtype=torch.long, device="cpu")
     parts = entries, values, exists, site_of[entries[:, 0]], real, site_of[real]
     return _Sites(*(part.to(device) for part in parts))
 

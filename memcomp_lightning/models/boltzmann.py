@@ -389,7 +389,7 @@ def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor,
     """Pairs of entries, all of one site with all of the other, in ascending order."""
     if len(site_of) == n_sites:
         return site_pairs
-    entries = torch.arange(len(site_of)).split(torch.bincount(site_of, minlength=n_sites).tolist())
+    entries = torch.arange(len(site_of), device="cpu").split(torch.bincount(site_of, minlength=n_sites).tolist())
     found = torch.cat([torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist()])
     return found[(found[:, 0] * len(site_of) + found[:, 1]).argsort()]
 
@@ -406,7 +406,7 @@ def _is_real(units: Units) -> Tensor:
     """Which entries are real, ``(n,)``."""
     if isinstance(units, Mixed):
         return torch.cat([_is_real(kind) for kind in units.kinds])
-    return torch.full((units.n,), units.real, dtype=torch.bool)
+    return torch.full((units.n,), units.real, dtype=torch.bool, device="cpu")
 
 
 def _classes(n_sites: int, pairs: Pairs, real: Tensor) -> list[Tensor]:
@@ -414,7 +414,7 @@ def _classes(n_sites: int, pairs: Pairs, real: Tensor) -> list[Tensor]:
     classes = colouring(n_sites, pairs)
     if sum(bool(torch.isin(sites, real).any()) for sites in classes) <= 1:
         return classes
-    number = torch.arange(n_sites)
+    number = torch.arange(n_sites, device="cpu")
     number[real] = real[0]
     ends, _ = number[pairs].sort(dim=-1)
     apart = colouring(n_sites, ends.unique(dim=0))

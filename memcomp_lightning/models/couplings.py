@@ -116,13 +116,13 @@ def contact_scores(
     found = model if isinstance(model, Couplings) else couplings(model)
     units = found.units
     at, n_sites, widest = _places(units)
-    counts = torch.ones(units.n, dtype=torch.bool)
+    counts = torch.ones(units.n, dtype=torch.bool, device="cpu")
     if gap is not None:
         require(0 <= gap < widest, "gap", gap, f"a number of a state, from 0 to {widest - 1}, or None")
         sizes = torch.bincount(units.site_of().cpu(), minlength=n_sites)
         counts = ~((at.cpu() % widest == gap) & (sizes[units.site_of().cpu()] > 1))
-    site = torch.zeros(units.n, n_sites, dtype=torch.float64)
-    site[torch.arange(units.n), units.site_of().cpu()] = counts.double()
+    site = torch.zeros(units.n, n_sites, dtype=torch.float64, device="cpu")
+    site[torch.arange(units.n, device="cpu"), units.site_of().cpu()] = counts.double()
     site = site.to(found.J.device)
     norms = (site.T @ found.J.square() @ site).sqrt()
     norms = (norms + norms.mT) / 2  # the same to the last digit
@@ -213,4 +213,6 @@ def _expected(model: RBM, field: Tensor, variance: Tensor, nodes: Tensor, rule: 
 def _rule(like: Tensor) -> tuple[Tensor, Tensor]:
     """Nodes and weights of a normal mean."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(N_NODES)
-    return torch.as_tensor(nodes).to(like), torch.as_tensor(weights / math.sqrt(2 * math.pi)).to(like)
+    return torch.as_tensor(nodes, device="cpu").to(like), torch.as_tensor(
+        weights / math.sqrt(2 * math.pi), device="cpu"
+    ).to(like)

@@ -144,16 +144,18 @@ class _Sites(NamedTuple):
 def _sites_of(units: Units, like: Tensor) -> _Sites:
     form = units.bits()
     grouped = {bit for group in form.groups for bit in group}
-    alone = torch.tensor([bit for bit in range(len(form.at)) if bit not in grouped], dtype=torch.long)
+    alone = torch.tensor(
+        [bit for bit in range(len(form.at)) if bit not in grouped], dtype=torch.long, device="cpu"
+    )
     n_groups, widest = len(form.groups), max(map(len, form.groups), default=1)
     n_sites, n_states = n_groups + len(alone), max(widest, 2 if len(alone) else 1)
     at, of_low, of_width = form.at.cpu(), form.low.to(like).cpu(), form.width.to(like).cpu()
-    entries = torch.full((n_sites, widest), units.n, dtype=torch.long)
-    low, width = torch.zeros(2, n_sites, widest, dtype=like.dtype)
-    on = torch.zeros(n_sites, n_states, widest, dtype=like.dtype)
-    exists = torch.zeros(n_sites, n_states, dtype=torch.bool)
+    entries = torch.full((n_sites, widest), units.n, dtype=torch.long, device="cpu")
+    low, width = torch.zeros(2, n_sites, widest, dtype=like.dtype, device="cpu")
+    on = torch.zeros(n_sites, n_states, widest, dtype=like.dtype, device="cpu")
+    exists = torch.zeros(n_sites, n_states, dtype=torch.bool, device="cpu")
     for site, group in enumerate(form.groups):
-        q, some = len(group), torch.tensor(group)
+        q, some = len(group), torch.tensor(group, device="cpu")
         entries[site, :q], low[site, :q], width[site, :q] = at[some], of_low[some], of_width[some]
         on[site, :, 0] = 1.0
         on[site, :q, :q] = torch.eye(q, dtype=like.dtype)

@@ -95,7 +95,7 @@ def test_baseline_and_partitions_report_mean_and_error(memcomp_train: Run) -> No
 def test_help_names_groups_and_examples(memcomp_train: Run) -> None:
     outcome = memcomp_train("--help")
     assert outcome.status == 0
-    assert "sampler: annealer, cd, dmm_qubo, dmm_time_average, dwave_qpu" in outcome.out
+    assert "sampler: annealer, block_annealing, cd, dmm_qubo" in outcome.out
     assert "resume=RUN_FOLDER" in outcome.out
 
 

@@ -155,7 +155,7 @@ def test_its_own_tests_pass(python: Path, project: Path) -> None:
 
 def test_help_of_our_command(python: Path, tmp_path: Path) -> None:
     out = run_warm(python, python.parent / "memcomp-train", "--help", folder=tmp_path)
-    assert "sampler: annealer, cd, dmm_qubo" in out
+    assert "sampler: annealer, block_annealing, cd" in out
     assert "hparams: pretraining" in out
 
 
@@ -164,7 +164,7 @@ def test_our_types_are_seen(python: Path, project: Path, tmp_path: Path) -> None
     wrong.write_text("from memcomp_lightning.models import RBM\n\nRBM('three', 2)\n")
     mypy = [sys.executable, "-m", "mypy", "--python-executable", python, "--cache-dir", os.devnull]
     out = run(*mypy, "sparse_digits", wrong, folder=project, status=1)
-    assert 'wrong.py:3: error: Argument 1 to "RBM" has incompatible type "str"; expected "int"' in out
+    assert 'wrong.py:3: error: Argument 1 to "RBM" has incompatible type "str"; expected "int | None"' in out
     assert "Found 1 error in 1 file" in out
 
 

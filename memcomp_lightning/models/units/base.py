@@ -190,7 +190,7 @@ class Units(nn.Module):
 
     def site_of(self) -> Tensor:
         """The site of each entry, ``(n,)`` int64, on the CPU."""
-        return torch.arange(self.n)
+        return torch.arange(self.n, device="cpu")
 
     def over_sites(self, of_sites: Tensor) -> Tensor:
         """Give each entry what its site has: ``(..., n_sites)`` to ``(..., n)``."""

@@ -88,7 +88,9 @@ class Bernoulli(Units):
 
     def bits(self) -> Bits:
         """A bit a unit."""
-        return Bits(torch.arange(self.n), torch.zeros(self.n), torch.ones(self.n))
+        return Bits(
+            torch.arange(self.n, device="cpu"), torch.zeros(self.n, device="cpu"), torch.ones(self.n, device="cpu")
+        )
 
     def beside(self, other: Units) -> "Bernoulli | None":
         """Units in {0, 1} all together."""

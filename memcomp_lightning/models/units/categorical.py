@@ -47,8 +47,10 @@ class Categorical(Units):
         self.sizes = tuple(sizes)
         widest = max(sizes, default=1)
         self._q = widest if all(size == widest for size in sizes) else None
-        sites = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes, dtype=torch.long))
-        begins = torch.tensor(list(accumulate([0, *sizes[:-1]])) if sizes else [], dtype=torch.long)
+        sites = torch.repeat_interleave(
+            torch.arange(len(sizes), device="cpu"), torch.tensor(sizes, dtype=torch.long, device="cpu")
+        )
+        begins = torch.tensor(list(accumulate([0, *sizes[:-1]])) if sizes else [], dtype=torch.long, device="cpu")
         self._on_the_cpu = sites
         self._site: Tensor
         self._begin: Tensor
@@ -56,9 +58,9 @@ class Categorical(Units):
         self._sizes: Tensor
         self.register_buffer("_site", sites, persistent=False)
         self.register_buffer("_begin", begins, persistent=False)
-        self.register_buffer("_sizes", torch.tensor(sizes, dtype=torch.long), persistent=False)
+        self.register_buffer("_sizes", torch.tensor(sizes, dtype=torch.long, device="cpu"), persistent=False)
         # Where each entry goes in a table (n_sites, widest) with empty places.
-        slot = sites * widest + torch.arange(self.n) - begins[sites] if sizes else sites
+        slot = sites * widest + torch.arange(self.n, device="cpu") - begins[sites] if sizes else sites
         self.register_buffer("_slot", slot, persistent=False)
         self._widest = widest
 
@@ -211,7 +213,12 @@ class Categorical(Units):
     def bits(self) -> Bits:
         """A bit a state, exactly one of them on in each site."""
         groups = [list(range(b, b + size)) for b, size in zip(self._begin.tolist(), self.sizes, strict=True)]
-        return Bits(torch.arange(self.n), torch.zeros(self.n), torch.ones(self.n), groups)
+        return Bits(
+            torch.arange(self.n, device="cpu"),
+            torch.zeros(self.n, device="cpu"),
+            torch.ones(self.n, device="cpu"),
+            groups,
+        )
 
     def site_of(self) -> Tensor:
         """The site of each entry."""

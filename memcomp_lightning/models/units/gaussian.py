@@ -42,7 +42,7 @@ class Gaussian(Units):
 
     def __init__(self, n: int, *, variance: float | Tensor = 1.0, learned: bool = True) -> None:
         super().__init__(n)
-        given = torch.as_tensor(variance, dtype=torch.float32)
+        given = torch.as_tensor(variance, dtype=torch.float32, device="cpu")
         require(given.shape in ((), (n,)), "shape of variance", tuple(given.shape), f"() or ({n},)")
         wrong = ~((given > 0) & given.isfinite()).expand(n)
         if bool(wrong.any()):
@@ -148,7 +148,7 @@ class Gaussian(Units):
 
     def bits(self) -> Bits:
         """None: the units are integrated out."""
-        return Bits(torch.arange(0), torch.zeros(0), torch.zeros(0))
+        return Bits(torch.arange(0, device="cpu"), torch.zeros(0, device="cpu"), torch.zeros(0, device="cpu"))
 
     def select(self, entries: Tensor) -> "Gaussian":
         """Some of the units, with copies of their precisions."""

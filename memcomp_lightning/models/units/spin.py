@@ -82,7 +82,11 @@ class Spin(Units):
 
     def bits(self) -> Bits:
         """S = 2 x - 1."""
-        return Bits(torch.arange(self.n), torch.full((self.n,), -1.0), torch.full((self.n,), 2.0))
+        return Bits(
+            torch.arange(self.n, device="cpu"),
+            torch.full((self.n,), -1.0, device="cpu"),
+            torch.full((self.n,), 2.0, device="cpu"),
+        )
 
     def beside(self, other: Units) -> "Spin | None":
         """Spins all together."""
