@@ -6,6 +6,7 @@
     PEERS/bin/python experiments/units/peers.py --peer rbms --train F/train.npz --seconds 120 --out F/rbms.npz
     $RUN judge F --samples F/rbm.npz F/rbms.npz
     $RUN likelihood F --models F/rbm.pt
+    $RUN modes F --models F/rbm.pt
 
 `split` reads `$MEMCOMP_DATA_DIR/sequences/FAMILY.fasta.gz`, drops rows that stand twice, and divides clusters of
 rows, not rows: neighbours of 80 % identity, and theirs, stay together, so that no held-out row has a near copy
@@ -27,6 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import ground_states
 import numpy as np
 import torch
 from site_statistics import ALPHABET, N_STATES, RNA, compare, one_site
@@ -41,6 +43,7 @@ from memcomp_lightning.models.units import Bernoulli, Categorical, ReLU
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import (
     PCD,
+    BlockAnnealing,
     GroundState,
     ModeAssisted,
     ModeSchedule,
@@ -397,6 +400,19 @@ def likelihoods(given: argparse.Namespace) -> None:
         print(json.dumps({"model": path.stem} | found | clock.report("judging")), flush=True)
 
 
+def modes(given: argparse.Namespace) -> None:
+    """Ground states of trained models: how far each sampler is from the lowest of all, and processor seconds."""
+    rows, alphabet = load(given.folder / "train.npz")
+    samplers = {**ground_states.SAMPLERS, "long block annealing": BlockAnnealing(n_chains=128, n_sweeps=1000)}
+    for path in given.models:
+        model = model_of(path, rows.shape[1], len(alphabet)).requires_grad_(False)
+        found = {name: ground_states.found_by(model, sampler, 0) for name, sampler in samplers.items()}
+        lowest = min(one.energy for one in found.values())
+        for name, (energy, seconds, kept) in found.items():
+            gap = 100 * (energy - lowest) / abs(lowest)
+            print(f"| {path.stem} | {name} | {gap:.3f} | {seconds:.2f} | {100 * kept:.1f} |", flush=True)
+
+
 def arguments(given: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     commands = parser.add_subparsers(required=True)
@@ -428,6 +444,10 @@ def arguments(given: Sequence[str] | None) -> argparse.Namespace:
     one.add_argument("--chains", type=int, default=100)
     one.add_argument("--betas", type=int, default=1000)
     one.set_defaults(run=likelihoods)
+    one = commands.add_parser("modes", help="ground states of trained RBMs by several solvers")
+    one.add_argument("folder", type=Path)
+    one.add_argument("--models", type=Path, nargs="+", required=True)
+    one.set_defaults(run=modes)
     return parser.parse_args(given)
 
 
