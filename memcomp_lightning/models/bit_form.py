@@ -46,6 +46,10 @@ def bit_form(model: EnergyModel) -> BitForm:
     Raises:
         SettingError: The model has units without a form in bits.
     """
+    if _in_bits_already(model):  # asked in each update of small models: nothing is looked up or changed
+        zero, at = model.b.new_zeros(()), torch.arange(model.n_units, device=model.b.device)
+        low, width, offset = zero.expand(at.shape), (zero + 1).expand(at.shape), zero.expand(model.replicas)
+        return BitForm(model.quadratic_form(), offset, model.n_visible, at, low, width, [])
     visible, hidden = model.visible.bits(), model.hidden.bits()
     at = torch.cat((visible.at, hidden.at + model.n_visible)).to(model.b.device)
     low, width = (
@@ -54,8 +58,6 @@ def bit_form(model: EnergyModel) -> BitForm:
     n_first, shift = len(visible.at), len(visible.at)
     groups = [*visible.groups, *([bit + shift for bit in group] for group in hidden.groups)]
     zero = model.b.new_zeros(model.replicas)
-    if type(model.visible) is Bernoulli and type(model.hidden) is Bernoulli:
-        return BitForm(model.quadratic_form(), zero, n_first, at, low, width, groups)
     form = model.quadratic_form()
     if form.pairs is None and not _has_real(model):
         changed, offset = _of_layers(form, visible, hidden)
@@ -121,9 +123,16 @@ def _matrix(model: EnergyModel, form: QuadraticForm) -> tuple[Float[Tensor, "*re
     return matrix + matrix.mT, adjacent | adjacent.mT
 
 
+def _in_bits_already(model: EnergyModel) -> bool:
+    return type(model.visible) is Bernoulli and type(model.hidden) is Bernoulli
+
+
 @torch.no_grad()
 def read_bits(model: EnergyModel, form: BitForm, y: Shaped[Tensor, "*replicas n n_bits"]) -> Configurations:
     """Configurations of a model at bits; real units stand at their means given the others."""
+    if _in_bits_already(model):
+        x = y.to(form.low)
+        return Configurations(x[..., : model.n_visible], x[..., model.n_visible :])
     x = form.low.new_zeros(*y.shape[:-1], model.n_units)
     x[..., form.at] = form.low + form.width * y.to(form.low)
     return at_real_means(model, Configurations(x[..., : model.n_visible], x[..., model.n_visible :]))
