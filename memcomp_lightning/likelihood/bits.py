@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.likelihood.boltzmann import double_of
+from memcomp_lightning.models.bit_form import bit_form
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Bernoulli
 
@@ -31,17 +33,14 @@ def in_bits(model: RBM) -> InBits | None:
     if model.visible.real or model.hidden.real:
         return None
     try:
-        visible, hidden = model.visible.bits(), model.hidden.bits()
+        form = bit_form(double_of(model))
     except SettingError:  # a kind of one's own need not have any
         return None
-    if visible.groups or hidden.groups:
+    if form.groups:
         return None
-    like = zero
-    low_v, width_v, low_h, width_h = (x.to(like) for x in (visible.low, visible.width, hidden.low, hidden.width))
-    weight, b, c = (x.detach().double() for x in (model.weight, model.b, model.c))
-    of_v, of_h = b + low_h @ weight, c + weight @ low_v
+    coupling, bias = form.form.coupling, form.form.bias
     rbm = RBM(model.n_visible, model.n_hidden, replicas=model.replicas).double().to(model.b.device)
-    rbm.weight.copy_(weight * width_h.unsqueeze(-1) * width_v)
-    rbm.b.copy_(of_v * width_v)
-    rbm.c.copy_(of_h * width_h)
-    return InBits(rbm, -((of_v * low_v).sum(-1) + (c * low_h).sum(-1)))
+    rbm.weight.copy_(coupling)
+    rbm.b.copy_(bias[..., : model.n_visible])
+    rbm.c.copy_(bias[..., model.n_visible :])
+    return InBits(rbm, form.offset)
