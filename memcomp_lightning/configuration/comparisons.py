@@ -15,7 +15,7 @@ from memcomp_lightning.files import write_json
 from memcomp_lightning.models import joint_model, stacked
 from memcomp_lightning.studies import LikelihoodTrial, Records, runner
 from memcomp_lightning.studies.measures import MEASURES
-from memcomp_lightning.studies.plan import pretraining_of
+from memcomp_lightning.studies.plan import images_of, pretraining_of
 from memcomp_lightning.studies.worth import Comparison, Method
 
 _SET_BY_COMPARISON = {
@@ -39,7 +39,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         own = OmegaConf.create(trial.settings)
         plan = build(own)
         check_without_trainer(plan, own)
-        data = pretraining_of(plan)[0].data
+        data = images_of(pretraining_of(plan)[0])
         require(data.replicas == (), "data.partitions", data.replicas, "1: replicas are seeds here")
         if (trial.data_set, trial.method) not in seen:
             seen.add((trial.data_set, trial.method))

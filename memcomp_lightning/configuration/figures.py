@@ -110,7 +110,7 @@ def _read(config: DictConfig, overrides: Sequence[str]) -> tuple[Figure, dict[st
     plan = FigurePlan(
         name=figure.name,
         title=figure.title,
-        data=data.images.name,
+        data=data.data_name,
         against=figure.against,
         passes=sorted(figure.passes),
         claims=figure.claims,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache, partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import lightning.pytorch as pl
 import torch
@@ -22,8 +22,8 @@ from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.values import check_values, require_held_out
-from memcomp_lightning.data import ImageData, ImageDataModule, ImageSource
-from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
+from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, RowsDataModule, TableDataModule
+from memcomp_lightning.errors import SettingError, UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
@@ -35,14 +35,23 @@ from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule
 from memcomp_lightning.training.schedules import check_schedules
 
+if TYPE_CHECKING:
+    from memcomp_lightning.data import TableData
+
+    Data: TypeAlias = ImageData | TableData
+
+MOST_NUMBERS = 2**26
+"""Values of training data that the initial biases are read from; of more, evenly spaced rows."""
+
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
 _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
+_DEALT = ("partitions", "first_partitions", "validation_fraction", "chunk_size")
 _SETTINGS = {
     "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
-    "data": ("source", "partitions", "first_partitions", "validation_fraction", "chunk_size"),
+    "data": ("source", *_DEALT),
     "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "penalties", "stage"),
-    "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best"),
+    "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best", "labels"),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
@@ -56,8 +65,9 @@ def build(config: DictConfig) -> Plan:
             out of range; data or weights cannot be read.
     """
     for group, known in _SETTINGS.items():
+        own = _of_source(config) if group == "data" else ()
         for name in config if group == "" else config[group]:
-            require_choice(f"setting {group}".rstrip(), name, known)
+            require_choice(f"setting {group}".rstrip(), name, (*known, *own))
     check_values(config)
     seed = config.seed
     precision_of(config.trainer.precision)
@@ -65,22 +75,24 @@ def build(config: DictConfig) -> Plan:
     for name, values in config.tried.items():
         numbers = isinstance(values, ListConfig) and all(isinstance(x, int | float) for x in values)
         require(numbers, f"tried.{name}", values, "a list of numbers")
-    images = _loaded(instantiate(config.data.source))
-    units = _units(config.units, "units", images.layout.n_visible)
-    network = _network(config, images, units)
+    data = _loaded(config)
+    shape = shape_of(data, config)
+    units = shape.units
+    network = network_of(config, shape)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = stage_for = None
     models = energy_models(network)
     if models and config.pretrain.iterations > 0:
-        callbacks, data = _callbacks(config, "pretrain"), _data(config, "pretrain", images, units)
+        callbacks, rows = _callbacks(config, "pretrain"), _data(config, "pretrain", data, units)
         centring = _part(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
-            start_at_means(models[0], data.train[0], data.train_observed)
+            v, _, observed = rows.some_train(MOST_NUMBERS)
+            start_at_means(models[0], v, observed)
         schedules = _schedules(config, "pretrain")
         stage_for = instantiate(config.pretrain.stage)
         try:
@@ -89,7 +101,7 @@ def build(config: DictConfig) -> Plan:
             raise UserError(f"pretrain.stage: {error}") from error
         module = EnergyPretraining(
             stage,
-            _sampler(config, data),
+            _sampler(config, rows),
             iterations=config.pretrain.iterations,
             optimizer=_optimizer(config, "pretrain", schedules),
             schedules=schedules,
@@ -97,8 +109,8 @@ def build(config: DictConfig) -> Plan:
             penalties=_penalties(config),
             seed=seed,
         )
-        pretraining = Stage(module, data, callbacks)
-    if config.finetune.iterations > 0:
+        pretraining = Stage(module, rows, callbacks)
+    if config.finetune.iterations > 0 and data.n_classes:
         layered = isinstance(network, DBN) or not models
         allowed = "0 for a Boltzmann machine, which is no feed-forward network"
         remedy = "For a deep one that is fine-tuned use model=dbn pretrain=joint."
@@ -107,30 +119,35 @@ def build(config: DictConfig) -> Plan:
         if config.finetune.keep_best:
             require_held_out(config, "where finetune.keep_best is true", "pass")
             callbacks.append(BestWeights())
-        schedules = _schedules(config, "finetune")
-        make: Callable[..., Classifier] = partial(Classifier, network)
-        if isinstance(network, DBN):
-            make = partial(
-                DBNClassifier,
-                network,
-                n_classes=images.n_classes,
-                units=config.finetune.units,
-                output_init=instantiate(config.model.get("output_init")),
-                generator=rng.stream(seed, "output weights"),
-            )
-        classifier = make(
-            iterations=config.finetune.iterations,
-            optimizer=_optimizer(config, "finetune", schedules),
-            schedules=schedules,
-            loss=config.finetune.loss,
-            seed=seed,
-        )
-        finetuning = Stage(classifier, _data(config, "finetune", images, units), callbacks)
+        classifier = classifier_of(config, network, data.n_classes)
+        finetuning = Stage(classifier, _data(config, "finetune", data, units), callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
     allowed = "an integer >= 1 where there is no pretraining"
     require(bool(plan.stages), "finetune.iterations", config.finetune.iterations, allowed)
     return plan
+
+
+def classifier_of(config: DictConfig, network: nn.Module, n_classes: int) -> Classifier:
+    """The fine-tuning of a network."""
+    schedules = _schedules(config, "finetune")
+    make: Callable[..., Classifier] = partial(Classifier, network)
+    if isinstance(network, DBN):
+        make = partial(
+            DBNClassifier,
+            network,
+            n_classes=n_classes,
+            units=config.finetune.units,
+            output_init=instantiate(config.model.get("output_init")),
+            generator=rng.stream(config.seed, "output weights"),
+        )
+    return make(
+        iterations=config.finetune.iterations,
+        optimizer=_optimizer(config, "finetune", schedules),
+        schedules=schedules,
+        loss=config.finetune.loss,
+        seed=config.seed,
+    )
 
 
 def plan_of(settings: Mapping[str, object]) -> Plan:
@@ -177,6 +194,44 @@ def _units(settings: DictConfig, name: str, n_sites: int) -> Units:
     return cast(Units, units)
 
 
+class Shape(NamedTuple):
+    """What a network must fit: all that it needs to know of the data.
+
+    Attributes:
+        units: Visible units.
+        n_classes: Number of classes, 0 without labels.
+        layout: Where the units lie in a picture; None where they lie in none.
+    """
+
+    units: Units
+    n_classes: int
+    layout: PixelLayout | None
+
+
+def shape_of(data: "Data", config: DictConfig) -> Shape:
+    """What the network must fit: tables say themselves which units they need."""
+    if isinstance(data, ImageData):
+        allowed = "a kind of units; columns are those of data=table, data=arrays and data=sequences"
+        require("_target_" in config.units, "units", "columns", allowed)
+        return Shape(units_of_settings(config, data.layout.n_visible), data.n_classes, data.layout)
+    remedy = "Name the kinds of columns by data.columns={NAME: KIND}."
+    named = "_target_" not in config.units
+    require(named, "units", config.units.get("_target_"), "units=columns, which follow from the data", remedy)
+    return Shape(data.units(), data.n_classes, data.layout)
+
+
+def units_of_settings(config: DictConfig, n_sites: int) -> Units:
+    """Visible units of the kind that ``units`` names."""
+    return _units(config.units, "units", n_sites)
+
+
+def _of_source(config: DictConfig) -> list[str]:
+    """Names in the group ``data`` that the settings of its source refer to."""
+    source = OmegaConf.to_container(config.data.source, resolve=False)
+    assert isinstance(source, dict)
+    return [found[1] for value in source.values() if (found := re.fullmatch(r"\$\{data\.(\w+)\}", str(value)))]
+
+
 def _penalties(config: DictConfig) -> list[Penalty]:
     """What the couplings cost in pretraining."""
     found = []
@@ -189,14 +244,16 @@ def _penalties(config: DictConfig) -> list[Penalty]:
     return found
 
 
-def _network(config: DictConfig, images: ImageData, units: Units) -> nn.Module:
+def network_of(config: DictConfig, shape: Shape) -> nn.Module:
+    """The network of a run, with drawn weights or those of ``model.weights``."""
+    units, layout = shape.units, shape.layout
     settings = OmegaConf.to_container(config.model, resolve=True)
     assert isinstance(settings, dict)
     weights = settings.pop("weights", None)
     settings.pop("output_init", None)
     partitions, first = config.data.partitions, config.data.first_partitions
     require_count("data.partitions", partitions)
-    layout, parameters = images.layout, inspect.signature(get_class(settings["_target_"])).parameters
+    parameters = inspect.signature(get_class(settings["_target_"])).parameters
     arguments: dict[str, Any] = {
         "replicas": (min(partitions, first or partitions),) if partitions > 1 else (),
         "generator": rng.stream(config.seed, "weights"),
@@ -204,17 +261,21 @@ def _network(config: DictConfig, images: ImageData, units: Units) -> nn.Module:
     }
     connectivity = settings.get("connectivity")
     if isinstance(connectivity, dict) and "_target_" in connectivity:
-        of_picture = {"height": layout.height, "width": layout.width, "pixels": layout.pixels}
+        of_picture = (
+            {} if layout is None else {"height": layout.height, "width": layout.width, "pixels": layout.pixels}
+        )
         known = inspect.signature(get_method(connectivity["_target_"])).parameters
         own = {name: value for name, value in of_picture.items() if name in known}
-        settings["connectivity"] = {**connectivity, **(own or {"n_visible": layout.n_visible})}
+        allowed = "null for data that are no pictures, or data.picture=[HEIGHT, WIDTH]"
+        require(bool(own) or "height" not in known, "model.connectivity", connectivity["_target_"], allowed)
+        settings["connectivity"] = {**connectivity, **(own or {"n_visible": units.n_sites})}
     if "hidden" in settings:
         require_count("model.n_hidden", settings["n_hidden"])
         arguments["hidden"] = _units(config.model.hidden, "model.hidden", settings.pop("n_hidden"))
         settings.pop("hidden")
     factory = instantiate(settings, _partial_=True, _convert_="all")
     if "n_classes" in parameters:
-        arguments["n_classes"] = images.n_classes
+        arguments["n_classes"] = shape.n_classes
     try:
         network: nn.Module = factory(**arguments)
     except TypeError as error:
@@ -226,7 +287,7 @@ def _network(config: DictConfig, images: ImageData, units: Units) -> nn.Module:
     return network
 
 
-def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
+def _sampler(config: DictConfig, data: RowsDataModule) -> Any:
     """The sampler; the schedule of mode assistance spans all updates of a layer unless it says otherwise."""
     settings = copy.deepcopy(config.sampler)
     schedule, size = settings.get("schedule"), min(config.pretrain.batch_size or data.n_train, data.n_train)
@@ -240,11 +301,18 @@ def _sampler(config: DictConfig, data: ImageDataModule) -> Any:
     return sampler
 
 
-def _data(config: DictConfig, stage: str, images: ImageData, units: Units) -> ImageDataModule:
-    settings = {name: config.data[name] for name in _SETTINGS["data"] if name != "source"}
+def _data(config: DictConfig, stage: str, data: "Data", units: Units) -> RowsDataModule:
+    """Batches of a stage: fine-tuning takes the rows that have a label, or as many as it is told."""
+    settings = {name: config.data[name] for name in _DEALT}
+    settings |= {"batch_size": config[stage].batch_size, "seed": config.seed}
+    if stage == "finetune":
+        settings["labels"] = "all" if config.finetune.labels is None else config.finetune.labels
     try:
-        size, seed = config[stage].batch_size, config.seed
-        return ImageDataModule(images, batch_size=size, seed=seed, units=units, **settings)
+        if isinstance(data, ImageData):
+            return ImageDataModule(data, units=units, **settings)
+        return TableDataModule(data, **settings)
+    except SettingError:
+        raise
     except ValueError as error:
         raise UserError(f"{stage}, data: {error}") from error
 
@@ -279,12 +347,14 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
     return callbacks
 
 
-def _loaded(source: ImageSource) -> ImageData:
-    require_parts("data.source", source, "source of images", ("load",))
-    images = _load_once(source) if isinstance(source, Hashable) else source.load()
-    is_data, kind = isinstance(images, ImageData), type(images).__name__
-    require(is_data, "data.source", kind, "a load() that returns an ImageData")
-    return images
+def _loaded(config: DictConfig) -> "Data":
+    """The data of a run; what is not images has a schema of its own."""
+    source = instantiate(config.data.source)
+    require_parts("data.source", source, "source of data", ("load",))
+    data = _load_once(source) if isinstance(source, Hashable) else source.load()
+    is_data, kind = isinstance(data, ImageData) or hasattr(data, "schema"), type(data).__name__
+    require(is_data, "data.source", kind, "a load() that returns an ImageData, or data with a schema")
+    return cast("Data", data)
 
 
 _load_once = lru_cache(maxsize=1)(methodcaller("load"))

@@ -1,6 +1,7 @@
-"""The images of one experiment, dealt into replicas and held-out parts, as Lightning wants them."""
+"""The rows of one experiment, dealt into replicas and held-out parts, as Lightning wants them."""
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -9,58 +10,68 @@ from torch import Tensor
 from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.loading import Batches
+from memcomp_lightning.data.rows import Rows, labelled
+from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
 
-
-class _Kept(NamedTuple):
-    """Some of the images, as the units keep them: ``(*replicas, n, n_sites)``."""
-
-    v: Tensor
-    label: Tensor
-    observed: Tensor | None
-
-    def at(self, index: Tensor) -> "_Kept":
-        return _Kept(self.v[index], self.label[index], None if self.observed is None else self.observed[index])
+if TYPE_CHECKING:
+    from memcomp_lightning.data.tables import TableData
 
 
-class ImageDataModule(LightningDataModule):
-    """Training, validation and test batches of one :class:`ImageData`.
+class RowsDataModule(LightningDataModule):
+    """Training, validation and test batches of one data set.
 
     With ``partitions > 1`` the training set is dealt into that many disjoint parts of
-    ``floor(n / partitions)`` images, and the parts become the replica axis: each replica of the model learns
-    from its own part, and all of them are tested on the same images. Up to ``partitions - 1`` images are
+    ``floor(n / partitions)`` rows, and the parts become the replica axis: each replica of the model learns
+    from its own part, and all of them are tested on the same rows. Up to ``partitions - 1`` rows are
     left over. How the set is dealt depends on ``partition_seed`` alone, so the parts stay the same when the
     seed of the training varies.
 
-    Held-out and test images come unshuffled, all of them in each process, as one step in chunks: the sum of
+    Held-out and test rows come unshuffled, all of them in each process, as one step in chunks: the sum of
     ``share * mean over the chunk`` is the mean over the set.
 
-    Batches hold values of the visible units: the kind of these says which ones stand for the grey values.
+    Batches hold values of the visible units, which are made of the numbers that are kept.
 
     Attributes:
         replicas: Leading axes of the batches: ``()``, or the number of parts in use, ``(n,)``.
-        n_train: Training images of one replica, without those held out.
+        n_train: Training rows of one replica, without those held out.
         units: The kind of the visible units: ``RBM(visible=data.units, ...)``.
+        n_classes: Number of classes, 0 without labels.
+        data_name: Of the data, for reports.
+        pixel_layout: Where the visible units lie in a picture; None where they lie in none.
 
     Args:
-        images: The data.
-        batch_size: Images of a replica in an optimiser step, over all processes; None means all of them.
+        train: Training rows, without replica axes.
+        test: Test rows.
+        units: Kind of the visible units, with a site for each number of a row.
+        n_classes: Number of classes, 0 without labels.
+        name: Of the data, for reports.
+        pixel_layout: Where the visible units lie in a picture.
+        validation: Rows that are held out; None holds out some of the training rows, as the next argument says.
+        batch_size: Rows of a replica in an optimiser step, over all processes; None means all of them.
         partitions: Number of parts, >= 1; 1 means the whole set and no replica axis.
         first_partitions: Use at most so many of the parts, >= 1; None means all.
-        validation_fraction: Share of each part's training images that is held out for validation, in
-            [0, 1), rounded to whole images. With 0 the *test* images are shown as validation set: look at
+        validation_fraction: Share of each part's training rows that is held out for validation, in
+            [0, 1), rounded to whole rows. With 0 the *test* rows are shown as validation set: look at
             them while training, but never choose a setting or a checkpoint by them.
-        chunk_size: Images of a replica in one Batch at most, >= 1: bounds the memory of large steps.
-        seed: Seed of the order in which training images come.
-        partition_seed: Seed of the partition and of the held-out images.
-        units: Kind of the visible units, with a site for each pixel; None is units in {0, 1}.
+        chunk_size: Rows of a replica in one Batch at most, >= 1: bounds the memory of large steps.
+        seed: Seed of the order in which training rows come.
+        partition_seed: Seed of the partition, of the held-out rows and of the labels.
+        labels: Take the rows that have a label alone, ``"all"`` or so many of the training rows, of each class its
+            share; None takes all rows.
     """
 
     def __init__(
         self,
-        images: ImageData,
+        train: Rows,
+        test: Rows,
         *,
+        units: Units,
+        n_classes: int,
+        name: str,
+        pixel_layout: PixelLayout | None = None,
+        validation: Rows | None = None,
         batch_size: int | None = defaults.BATCH_SIZE,
         partitions: int = 1,
         first_partitions: int | None = None,
@@ -68,52 +79,65 @@ class ImageDataModule(LightningDataModule):
         chunk_size: int = 10_000,
         seed: int = 0,
         partition_seed: int = 0,
-        units: Units | None = None,
+        labels: int | Literal["all"] | None = None,
     ) -> None:
         super().__init__()
-        self.units = Bernoulli(images.n_visible) if units is None else units
-        n_sites, allowed = self.units.n_sites, f"{images.n_visible}, one for each pixel"
-        require(n_sites == images.n_visible, "number of sites of the units", n_sites, allowed)
-        n_part, n_held_out = _split(images, partitions, validation_fraction, partition_seed)
+        if labels is not None:
+            train = labelled(train, None if labels == "all" else labels, n_classes, seed=partition_seed)
+            test = labelled(test, None, n_classes, seed=0)
+            validation = None if validation is None else labelled(validation, None, n_classes, seed=0)
+        self.units, self.n_classes, self.data_name, self.pixel_layout = units, n_classes, name, pixel_layout
+        remedy = "Rows to look at are given: leave validation_fraction at 0."
+        twice = validation is not None and validation_fraction != 0
+        require(not twice, "validation_fraction", validation_fraction, "0", remedy)
+        n_part, n_held_out = _split(train.n, partitions, validation_fraction, partition_seed)
         n_parts = partitions
         if first_partitions is not None:
             require_count("first_partitions", first_partitions)
             n_parts = min(partitions, first_partitions)
-        self.images = images
         self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
         self.n_train = n_part - n_held_out
-        self._train, self._test = self._kept("train"), self._kept("test")
-        self._heldout = self._test
-        # Without parts and without a held-out set there is nothing to deal, and no copy of the images.
+        self._train, self._test = train, test
+        self._heldout = test if validation is None else validation
+        # Without parts and without a held-out set there is nothing to deal, and no copy of the rows.
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
-            order = torch.randperm(len(images.train_label), generator=generator, device=generator.device)
+            order = torch.randperm(train.n, generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
-            everything = self._train
-            self._train = everything.at(order[..., : self.n_train])
+            self._train = train.at(order[..., : self.n_train])
             if n_held_out:
-                self._heldout = everything.at(order[..., self.n_train :])
+                self._heldout = train.at(order[..., self.n_train :])
         self.train_batches(rank=0, world_size=1)
 
     @property
+    def schema(self) -> Schema | None:
+        """What the units stand for; None where nothing is known of it."""
+        return None
+
+    @property
+    def described(self) -> str:
+        """What the data are taken for, for people; nothing where there is no question."""
+        return ""
+
+    @property
     def train(self) -> tuple[Tensor, Tensor]:
-        """Training images ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
+        """Training rows ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
         return self._values(self._train)
 
     @property
     def train_observed(self) -> Tensor | None:
-        """Where the training images are known, a mask of their shape; None is everywhere."""
+        """Where the training rows are known, a mask of their shape; None is everywhere."""
         return self._mask(self._train)
 
     @property
     def test(self) -> tuple[Tensor, Tensor]:
-        """Test images ``(n, n_visible)`` and labels ``(n,)``."""
+        """Test rows ``(n, n_visible)`` and labels ``(n,)``."""
         return self._values(self._test)
 
     @property
     def heldout(self) -> tuple[Tensor, Tensor]:
-        """The images of the validation: those held out, or the test images, which all replicas share."""
+        """The rows of the validation: those held out, or the test rows, which all replicas share."""
         return self._values(self._heldout)
 
     @property
@@ -123,16 +147,12 @@ class ImageDataModule(LightningDataModule):
 
     @property
     def validation(self) -> tuple[Tensor, Tensor] | None:
-        """Held-out training images ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
+        """Held-out training rows ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
         return None if self._heldout is self._test else self.heldout
-
-    def values_of(self, intensity: Tensor) -> Tensor:
-        """Values of the visible units that stand for grey values, ``(..., n_pixels)`` to ``(..., n_visible)``."""
-        return self.units.encode(self.units.from_intensity(intensity), check=False)
 
     @property
     def n_at_once(self) -> int:
-        """Training images of a replica that are computed together: of an update, or of a chunk of it."""
+        """Training rows of a replica that are computed together: of an update, or of a chunk of it."""
         return min(self.n_train, self._batch_size or self.n_train, self._chunk_size)
 
     @property
@@ -140,15 +160,19 @@ class ImageDataModule(LightningDataModule):
         """Number of visible units; of categories a site has one for each state."""
         return self.units.n
 
-    @property
-    def n_classes(self) -> int:
-        """Number of classes."""
-        return self.images.n_classes
+    def some_train(self, n_numbers: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Training rows, their labels and where they are known: of large data evenly spaced ones.
 
-    @property
-    def pixel_layout(self) -> PixelLayout:
-        """Where the visible units lie in the picture."""
-        return self.images.layout
+        Args:
+            n_numbers: Values of visible units of a replica at most.
+        """
+        step = -(-self.n_train * self.n_visible // n_numbers)
+        v, label, observed, weight = self._train
+        if step > 1:
+            v, label = v[..., ::step, :], label[..., ::step]
+            observed = None if observed is None else observed[..., ::step, :]
+        some = Rows(v, label, observed, weight)
+        return (*self._values(some), self._mask(some))
 
     def train_dataloader(self) -> Batches:
         """Return the shuffled training batches of this process."""
@@ -157,11 +181,11 @@ class ImageDataModule(LightningDataModule):
         return self.train_batches(self.trainer.global_rank, self.trainer.world_size)
 
     def val_dataloader(self) -> Batches:
-        """Return the held-out images, or the test images if none are held out."""
+        """Return the held-out rows, or the test rows if none are held out."""
         return self._evaluation_batches(self._heldout)
 
     def test_dataloader(self) -> Batches:
-        """Return the test images, the same for every replica."""
+        """Return the test rows, the same for every replica."""
         return self._evaluation_batches(self._test)
 
     def train_batches(self, rank: int, world_size: int) -> Batches:
@@ -176,33 +200,138 @@ class ImageDataModule(LightningDataModule):
             rank=rank,
             world_size=world_size,
             observed=self._train.observed,
+            weight=self._train.weight,
             units=self.units,
         )
 
-    def _evaluation_batches(self, kept: _Kept) -> Batches:
-        v, label, observed = kept
+    def _evaluation_batches(self, kept: Rows) -> Batches:
+        v, label, observed, weight = kept
         if label.ndim == 1:
             v, label = v.expand(*self.replicas, -1, -1), label.expand(*self.replicas, -1)
             observed = None if observed is None else observed.expand(*self.replicas, -1, -1)
         settings: dict[str, Any] = {"chunk_size": self._chunk_size, "shuffle": False, "seed": self._seed}
-        return Batches(v, label, None, **settings, observed=observed, units=self.units)
+        return Batches(v, label, None, **settings, observed=observed, weight=weight, units=self.units)
 
-    def _kept(self, subset: str) -> _Kept:
-        v, label, observed = (getattr(self.images, f"{subset}_{name}") for name in ("v", "label", "observed"))
-        return _Kept(self.units.from_intensity(v), label, observed)
-
-    def _values(self, kept: _Kept) -> tuple[Tensor, Tensor]:
+    def _values(self, kept: Rows) -> tuple[Tensor, Tensor]:
         return self.units.encode(kept.v, check=False), kept.label
 
-    def _mask(self, kept: _Kept) -> Tensor | None:
+    def _mask(self, kept: Rows) -> Tensor | None:
         return None if kept.observed is None else self.units.over_sites(kept.observed)
 
 
-def _split(images: ImageData, partitions: int, validation_fraction: float, partition_seed: int) -> tuple[int, int]:
-    """Images of a part, and how many of them are held out."""
-    n = len(images.train_label)
+class ImageDataModule(RowsDataModule):
+    """Training, validation and test batches of one :class:`ImageData`.
+
+    The kind of the visible units says which of their values stand for the grey values. All else is as in
+    :class:`RowsDataModule`.
+
+    Attributes:
+        images: The data.
+
+    Args:
+        images: The data.
+        units: Kind of the visible units, with a site for each pixel; None is units in {0, 1}.
+        settings: Of :class:`RowsDataModule`: ``batch_size``, ``partitions``, ``validation_fraction`` and so on.
+    """
+
+    def __init__(self, images: ImageData, *, units: Units | None = None, **settings: Any) -> None:
+        units = Bernoulli(images.n_visible) if units is None else units
+        n_sites, allowed = units.n_sites, f"{images.n_visible}, one for each pixel"
+        require(n_sites == images.n_visible, "number of sites of the units", n_sites, allowed)
+        train, test = (image_rows(images, subset, units) for subset in ("train", "test"))
+        own: dict[str, Any] = {"n_classes": images.n_classes, "name": images.name, "pixel_layout": images.layout}
+        super().__init__(train, test, units=units, **own, **settings)
+        self.images = images
+
+    @property
+    def schema(self) -> Schema:
+        """Where the pixels lie."""
+        return ImageSchema.of(self.images)
+
+    def values_of(self, intensity: Tensor) -> Tensor:
+        """Values of the visible units that stand for grey values, ``(..., n_pixels)`` to ``(..., n_visible)``."""
+        return self.units.encode(self.units.from_intensity(intensity), check=False)
+
+
+class TableDataModule(RowsDataModule):
+    """Training, validation and test batches of a table.
+
+    Attributes:
+        table: The data, with the schema of its columns.
+
+    Args:
+        table: From :class:`memcomp_lightning.data.Table`, :meth:`from_frame` or :meth:`from_array`.
+        settings: Of :class:`RowsDataModule`: ``batch_size``, ``partitions``, ``validation_fraction`` and so on.
+    """
+
+    def __init__(self, table: "TableData", **settings: Any) -> None:
+        own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
+        own |= {"validation": table.validation, "units": table.units()}
+        super().__init__(table.train, table.test, **own, **settings)
+        self.table = table
+
+    @property
+    def schema(self) -> Schema:
+        """What the units are in the user's columns."""
+        return self.table.schema
+
+    @property
+    def described(self) -> str:
+        """The columns with their kinds."""
+        return self.table.described()
+
+    @classmethod
+    def from_frame(
+        cls, frame: Any, *, columns: Mapping[str, str] | None = None, test_fraction: float = 0.1, **settings: Any
+    ) -> "TableDataModule":
+        """Batches of a DataFrame of pandas, or a table of Arrow.
+
+        Args:
+            frame: The rows.
+            columns: Kinds by column, see :class:`memcomp_lightning.data.Table`; the others are found.
+            test_fraction: Share of the rows that is split off as test rows.
+            settings: Of the class.
+        """
+        return cls(_data_of(frame, columns=columns, test_fraction=test_fraction), **settings)
+
+    @classmethod
+    def from_array(
+        cls,
+        array: Any,
+        label: Any = None,
+        *,
+        columns: Mapping[str, str] | str | None = None,
+        test_fraction: float = 0.1,
+        **settings: Any,
+    ) -> "TableDataModule":
+        """Batches of a matrix of NumPy, SciPy or torch, NaN being a missing value.
+
+        Args:
+            array: The rows.
+            label: A class for each row, -1 where it has none; None without labels.
+            columns: The kind of all columns, or kinds by their numbers as texts; None finds them.
+            test_fraction: Share of the rows that is split off as test rows.
+            settings: Of the class.
+        """
+        return cls(_data_of(array, label, columns=columns, test_fraction=test_fraction), **settings)
+
+
+def _data_of(*arguments: Any, **settings: Any) -> "TableData":
+    from memcomp_lightning.data.tables import data_of  # Arrow is read where a table is
+
+    return data_of(*arguments, **settings)
+
+
+def image_rows(images: ImageData, subset: str, units: Units) -> Rows:
+    """The ``train`` or ``test`` images as the units keep them."""
+    v, label, observed = (getattr(images, f"{subset}_{name}") for name in ("v", "label", "observed"))
+    return Rows(units.from_intensity(v), label, observed)
+
+
+def _split(n: int, partitions: int, validation_fraction: float, partition_seed: int) -> tuple[int, int]:
+    """Rows of a part, and how many of them are held out."""
     require_count("partitions", partitions)
-    require(partitions <= n, "partitions", partitions, f"at most the {n} training images")
+    require(partitions <= n, "partitions", partitions, f"at most the {n} training rows")
     require_count("partition_seed", partition_seed, minimum=0)
     in_range = isinstance(validation_fraction, int | float) and 0 <= validation_fraction < 1
     require(in_range, "validation_fraction", validation_fraction, "a number in [0, 1)")
@@ -212,7 +341,7 @@ def _split(images: ImageData, partitions: int, validation_fraction: float, parti
         validation_fraction == 0 or 1 <= n_held_out < n_part,
         "validation_fraction",
         validation_fraction,
-        f"0, or a share that holds out at least 1 and leaves at least 1 of {n_part} images; "
+        f"0, or a share that holds out at least 1 and leaves at least 1 of {n_part} rows; "
         f"this one holds out {n_held_out}",
         "Change validation_fraction or use fewer partitions.",
     )

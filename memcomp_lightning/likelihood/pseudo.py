@@ -1,7 +1,6 @@
 """Pseudo-likelihoods, which need no log Z: each visible unit given all others."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,6 +11,7 @@ from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
 from memcomp_lightning.models.base import EnergyModel, Images
 from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.models.sites import DiscreteSites
 
 NODES_A_DEVIATION = 4
 """Nodes of the trapezoidal rule a standard deviation of a real unit, of which its error is far below rounding."""
@@ -44,7 +44,10 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
     v, wide = pure_values(model, v), double_of(model)
     if model.n_hidden == 0:
         return in_chunks(lambda rows: _of_visible_alone(wide, rows), v, model.n_units)
-    sites = _sites_of(model, v.device)
+    sites = DiscreteSites.of(model.visible, like=v.double())
+    real = torch.ones(model.n_visible, dtype=torch.bool, device=v.device)
+    real[model.visible.bits().at] = False
+    site_of = model.visible.site_of().to(v.device)
     n_numbers = max(1, len(sites.at)) * max(model.n_hidden, model.n_visible)
 
     def of_rows(rows: Tensor) -> Tensor:
@@ -55,8 +58,8 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
         else:
             log_weight = lambda some: log_hidden_sum(wide, some, MOST_HIDDEN)  # noqa: E731
             found[..., sites.at] = _discrete(log_weight, rows, sites)
-        for entry, site in zip(sites.real.tolist(), sites.real_at.tolist(), strict=True):
-            found[..., site] = _real(log_weight, wide, rows, entry, n_numbers)
+        for entry in real.nonzero().flatten().tolist():
+            found[..., site_of[entry]] = _real(log_weight, wide, rows, entry, n_numbers)
         return found
 
     if not has_free_energy(model):
@@ -64,67 +67,20 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
     return in_chunks(of_rows, v, n_numbers)
 
 
-class _Sites(NamedTuple):
-    """The states of discrete sites, padded to the widest one, and which entries are real.
-
-    Attributes:
-        entries: Entries of each site, ``(n_sites, widest)``; padded by its first one.
-        values: What they are in each state, ``(n_sites, n_states, widest)`` float64; 0 where padded.
-        exists: Which states there are, ``(n_sites, n_states)`` bool.
-        at: Numbers of these sites in the layer.
-        real: Real entries, each a site of its own.
-        real_at: Numbers of these sites.
-    """
-
-    entries: Tensor
-    values: Tensor
-    exists: Tensor
-    at: Tensor
-    real: Tensor
-    real_at: Tensor
-
-
-def _sites_of(model: EnergyModel, device: torch.device) -> _Sites:
-    units = model.visible
-    bits, site_of = units.bits(), units.site_of().cpu()
-    grouped = {bit for group in bits.groups for bit in group}
-    alone = [bit for bit in range(len(bits.at)) if bit not in grouped]
-    sites = [list(group) for group in bits.groups] + [[bit] for bit in alone]
-    widest = max((len(site) for site in sites), default=1)
-    n_states = max([widest] * bool(bits.groups) + [2] * bool(alone), default=1)
-    at, low, width = bits.at.cpu(), bits.low.double().cpu(), bits.width.double().cpu()
-    entries = torch.zeros(len(sites), widest, dtype=torch.long, device="cpu")
-    values = torch.zeros(len(sites), n_states, widest, dtype=torch.float64, device="cpu")
-    exists = torch.zeros(len(sites), n_states, dtype=torch.bool, device="cpu")
-    for number, site in enumerate(sites):
-        some = torch.tensor(site, device="cpu")
-        entries[number] = at[some[0]]
-        entries[number, : len(site)] = at[some]
-        if site[0] in grouped:
-            values[number, : len(site), : len(site)] = low[some] + torch.diag(width[some])
-            exists[number, : len(site)] = True
-        else:
-            values[number, 0, 0], values[number, 1, 0] = low[some[0]], low[some[0]] + width[some[0]]
-            exists[number, :2] = True
-    real = torch.tensor(sorted(set(range(units.n)) - set(at.tolist())), dtype=torch.long, device="cpu")
-    parts = entries, values, exists, site_of[entries[:, 0]], real, site_of[real]
-    return _Sites(*(part.to(device) for part in parts))
-
-
-def _state_of(rows: Tensor, sites: _Sites) -> Tensor:
+def _state_of(rows: Tensor, sites: DiscreteSites) -> Tensor:
     """Number of the state that each site is in, ``(*replicas, n, n_sites)``."""
     off = (rows[..., sites.entries].unsqueeze(-2) - sites.values).abs().sum(-1)
     return off.masked_fill(~sites.exists, torch.inf).argmin(-1)
 
 
-def _other(state: Tensor, k: int, sites: _Sites) -> tuple[Tensor, Tensor]:
+def _other(state: Tensor, k: int, sites: DiscreteSites) -> tuple[Tensor, Tensor]:
     """The k-th state after each one, and whether there is such a one."""
     other = (state + k) % sites.exists.shape[-1]
     exists = torch.take_along_dim(sites.exists.expand(*other.shape, -1), other.unsqueeze(-1), -1).squeeze(-1)
     return other, exists
 
 
-def _discrete_of_rbm(rbm: RBM, rows: Tensor, sites: _Sites) -> Tensor:
+def _discrete_of_rbm(rbm: RBM, rows: Tensor, sites: DiscreteSites) -> Tensor:
     """Of discrete sites of an RBM: another state changes the hidden field by columns of W."""
     field, state = rbm.hidden_field(rows), _state_of(rows, sites)
     change = torch.einsum("saw,...isw->...sai", sites.values, rbm.weight[..., sites.entries]).unsqueeze(-4)
@@ -145,18 +101,18 @@ def _at(table: Tensor, state: Tensor) -> Tensor:
     return torch.take_along_dim(table, state[..., None, None], dim=-2).squeeze(-2)
 
 
-def _discrete(log_weight: LogWeight, rows: Tensor, sites: _Sites) -> Tensor:
+def _discrete(log_weight: LogWeight, rows: Tensor, sites: DiscreteSites) -> Tensor:
     """Of discrete sites, by the weight of each other state."""
     state, here = _state_of(rows, sites), log_weight(rows).unsqueeze(-1)
     gains = [torch.zeros_like(state, dtype=torch.float64)]
-    numbers = torch.arange(len(sites.entries), device=rows.device)
+    numbers, values = torch.arange(len(sites.entries), device=rows.device), sites.values
     for k in range(1, sites.exists.shape[-1]):
         other, exists = _other(state, k, sites)
         moved = rows.unsqueeze(-2).repeat(*[1] * (rows.ndim - 1), len(numbers), 1)
         # Padding repeats the first entry: it is written last.
         for place in reversed(range(sites.entries.shape[-1])):
             column = sites.entries[:, place]
-            moved[..., numbers, column] = sites.values[numbers, other, place]
+            moved[..., numbers, column] = values[numbers, other, place]
         weights = log_weight(moved.flatten(-3, -2)).unflatten(-1, state.shape[-2:])
         gains.append((weights - here).masked_fill(~exists, -torch.inf))
     return -torch.stack(gains).logsumexp(0)

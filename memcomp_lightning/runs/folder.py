@@ -93,6 +93,15 @@ class RunFolder:
                 "never mixed: choose another folder with hydra.run.dir=PATH, or go back to that version."
             )
 
+    def keep_schema(self, schema: Mapping[str, object]) -> None:
+        """Write what the units of the model stand for."""
+        write_json(self.path / "schema.json", schema)
+
+    @property
+    def schema(self) -> dict[str, Any] | None:
+        """What was kept by :meth:`keep_schema`."""
+        return self._read("schema.json")
+
     def finish_stage(self, stage: str, record: Mapping[str, object]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
         write_json(self.path / "stages.json", {**self.finished_stages, stage: record})

@@ -10,6 +10,7 @@ import lightning.pytorch as pl
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.spike import TrainingSpikeException
 from lightning.pytorch.loggers import Logger
+from lightning_utilities.core.rank_zero import rank_zero_only
 
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.callbacks import LogLikelihood
@@ -49,7 +50,9 @@ def run(
     """
     done = folder.finished_stages
     records: dict[str, Any] = {}
-    keeps = True
+    keeps, schema = True, plan.stages[0].data.schema
+    if schema is not None and int(getattr(rank_zero_only, "rank", 0)) == 0:
+        folder.keep_schema(schema.as_json())
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():

@@ -1,7 +1,7 @@
 """Pseudo-likelihood: each site is predicted from the others, so that training needs no samples of the model."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Generator, Tensor
@@ -11,7 +11,8 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.rbm import RBM
-from memcomp_lightning.models.units import Units, all_states
+from memcomp_lightning.models.sites import DiscreteSites
+from memcomp_lightning.models.units import all_states
 from memcomp_lightning.objective import shares
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
@@ -85,7 +86,7 @@ class PseudoLikelihood:
         self, model: EnergyModel, positive: Configurations, generator: Generator
     ) -> tuple[Configurations, Tensor]:
         v, share = positive.v, shares(positive)
-        sites = _sites_of(model.visible, v)
+        sites = DiscreteSites.of(model.visible, like=v)
         n_all = len(sites.entries)
         n_drawn = min(self.n_sites or n_all, n_all)
         at = torch.arange(n_all, device=v.device).expand(*v.shape[:-1], n_all)
@@ -122,52 +123,7 @@ def _of_visible_alone(model: EnergyModel, positive: Configurations) -> tuple[Con
     return Configurations(v, v[..., :0], weight), (share * log_p).sum(-1)
 
 
-class _Sites(NamedTuple):
-    """The states of each site, padded to the widest one.
-
-    Attributes:
-        entries: Entries of each site, ``(n_sites, widest)``; padded by the number of all entries.
-        low: Their low values, of the same shape.
-        width: What they gain at their high ones.
-        bits: Which entry is high in each state, ``(n_sites, n_states, widest)``; states that a site lacks are
-            as its first one.
-        exists: Which states there are, ``(n_sites, n_states)`` bool.
-    """
-
-    entries: Tensor
-    low: Tensor
-    width: Tensor
-    bits: Tensor
-    exists: Tensor
-
-
-def _sites_of(units: Units, like: Tensor) -> _Sites:
-    form = units.bits()
-    grouped = {bit for group in form.groups for bit in group}
-    alone = torch.tensor(
-        [bit for bit in range(len(form.at)) if bit not in grouped], dtype=torch.long, device="cpu"
-    )
-    n_groups, widest = len(form.groups), max(map(len, form.groups), default=1)
-    n_sites, n_states = n_groups + len(alone), max(widest, 2 if len(alone) else 1)
-    at, of_low, of_width = form.at.cpu(), form.low.to(like).cpu(), form.width.to(like).cpu()
-    entries = torch.full((n_sites, widest), units.n, dtype=torch.long, device="cpu")
-    low, width = torch.zeros(2, n_sites, widest, dtype=like.dtype, device="cpu")
-    on = torch.zeros(n_sites, n_states, widest, dtype=like.dtype, device="cpu")
-    exists = torch.zeros(n_sites, n_states, dtype=torch.bool, device="cpu")
-    for site, group in enumerate(form.groups):
-        q, some = len(group), torch.tensor(group, device="cpu")
-        entries[site, :q], low[site, :q], width[site, :q] = at[some], of_low[some], of_width[some]
-        on[site, :, 0] = 1.0
-        on[site, :q, :q] = torch.eye(q, dtype=like.dtype)
-        exists[site, :q] = True
-    entries[n_groups:, 0], low[n_groups:, 0], width[n_groups:, 0] = at[alone], of_low[alone], of_width[alone]
-    if len(alone):
-        on[n_groups:, 1, 0] = 1.0
-        exists[n_groups:, :2] = True
-    return _Sites(*(part.to(like.device) for part in (entries, low, width, on, exists)))
-
-
-def _each_state(v: Tensor, sites: _Sites, at: Tensor) -> tuple[Tensor, Tensor]:
+def _each_state(v: Tensor, sites: DiscreteSites, at: Tensor) -> tuple[Tensor, Tensor]:
     """Rows with a site in each of its states, and the probabilities of these states that the data have.
 
     The rows are ``(..., n, n_drawn, n_states, n_visible)``, the probabilities ``(..., n, n_drawn, n_states)``: 1
@@ -178,7 +134,8 @@ def _each_state(v: Tensor, sites: _Sites, at: Tensor) -> tuple[Tensor, Tensor]:
         sites: Of all sites.
         at: Which ones are changed, ``(..., n, n_drawn)``.
     """
-    entries, low, width, bits, exists = (part[at] for part in sites)
+    low, width, bits, exists = (part[at] for part in (sites.low, sites.width, sites.high, sites.exists))
+    entries = torch.where(width == 0, v.shape[-1], sites.entries[at])
     wide = torch.cat((v, torch.zeros_like(v[..., :1])), dim=-1)  # one more column takes what is padded
     moved = wide[..., None, None, :].repeat(*[1] * (v.ndim - 1), at.shape[-1], exists.shape[-1], 1)
     values = low.unsqueeze(-2) + width.unsqueeze(-2) * bits

@@ -22,7 +22,7 @@ from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.measures.gradient_bias import gradient_bias, mean_gradient, without_diverged
-from memcomp_lightning.studies.plan import Plan, Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.plan import Plan, Trial, images_of, passes_without_trainer, pretraining_of
 from memcomp_lightning.studies.records import Measures, Record
 from memcomp_lightning.studies.worth import Comparison
 from memcomp_lightning.training import Batches, DivergedError, Greedy, Pass
@@ -71,7 +71,7 @@ class LikelihoodTrial(Trial):
         batches = stage.data.train_batches(0, 1).repeated(range(n_replicas))
         _warm_up(joint_model(network), module, next(iter(batches)).v)
         measure, seconds = MEASURES[self.comparison.data_sets[self.data_set].measure], 0.0
-        score = measure.make(stage.data, n_reported)
+        score = measure.make(images_of(stage), n_reported)
         begin, reported = time.process_time(), 0
         passes, present_model = _training(self, plans[0], network, batches)
         names = ["score", "reverse"][: 1 + measure.both_ways]

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import lightning.pytorch as pl
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.data import ImageDataModule
+from memcomp_lightning.data import ImageDataModule, RowsDataModule
+from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule
 from memcomp_lightning.studies.records import Named
@@ -20,7 +21,7 @@ class Stage:
     """One fit: what is trained, its images, and what looks at it under a trainer."""
 
     module: StageModule
-    data: ImageDataModule
+    data: RowsDataModule
     callbacks: list[pl.Callback]
 
 
@@ -73,6 +74,11 @@ class Plan:
             self.between(self.network, generator=rng.stream(seed, "between stages"))
 
     @property
+    def described(self) -> str:
+        """The columns of the data as they are taken, for people; nothing of pictures."""
+        return self.stages[0].data.described
+
+    @property
     def stages(self) -> list[Stage]:
         """The stages in order."""
         return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
@@ -97,6 +103,18 @@ def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
     assert stage is not None
     assert isinstance(stage.module, EnergyPretraining)
     return stage, stage.module
+
+
+def images_of(stage: Stage) -> ImageDataModule:
+    """The images of a stage.
+
+    Raises:
+        SettingError: They are no images.
+    """
+    data = stage.data
+    allowed = "images: comparisons by likelihood take data=digits, mnist and the like"
+    require(isinstance(data, ImageDataModule), "data", data.data_name, allowed)
+    return cast(ImageDataModule, data)
 
 
 def finetuning_of(plan: Plan) -> tuple[Stage, Classifier]:

@@ -29,7 +29,7 @@ def draw_trajectory(plan: Plan, solver: DmmSolver, *, seed: int, folder: Path) -
     assert isinstance(solution.trajectory, Trajectory)
     first = tuple(0 for _ in rbm.replicas)
     trajectory = Trajectory(*(values[first] for values in solution.trajectory))
-    data = plan.pretraining.data.images.name
+    data = plan.pretraining.data.data_name
     title = f"{data}: {rbm.n_visible}x{rbm.n_hidden} RBM after {n} iterations"
     save(folder, "figure2", plot_trajectory(trajectory, title=title))
     energies = solution.energies[first]

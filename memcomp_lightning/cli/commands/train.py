@@ -114,8 +114,11 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
             loggers = [instantiate(logger) for logger in config.logger.values() if logger is not None]
             pairs = [override.partition("=") for override in overrides if not override.startswith("hydra.")]
             by_name = {name: value for name, _, value in pairs}
+            plan = build(config)
+            if _is_first_process() and plan.described:
+                say(f"{plan.described}\n")
             result = pipeline.run(
-                build(config),
+                plan,
                 folder,
                 make_trainer=lambda stage: trainer_of(stage, config, folder, loggers),
                 loggers=loggers,

@@ -1,0 +1,161 @@
+"""What the units of a trained model stand for: kept with it, so that what comes out is in the user's own terms."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from memcomp_lightning.data.images import ImageData, PixelLayout
+from memcomp_lightning.data.rows import UNLABELLED, Rows
+from memcomp_lightning.errors import UserError, require_choice
+from memcomp_lightning.models.units import Units
+
+Columns = dict[str, NDArray[Any]]
+"""Columns of a table by name, of one length; None and NaN are empty cells."""
+
+
+class Schema(Protocol):
+    """What a kind of data knows of its units; it is written as JSON beside the weights."""
+
+    @property
+    def n_sites(self) -> int:
+        """Numbers of a row: sites of the visible units."""
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes, 0 without labels."""
+
+    @property
+    def class_names(self) -> list[str]:
+        """The classes in words."""
+
+    @property
+    def site_names(self) -> list[str]:
+        """Names of the sites."""
+
+    @property
+    def entry_names(self) -> list[str]:
+        """Names of the visible units: a category has one for each of its values."""
+
+    @property
+    def log_scale(self) -> float:
+        """What a log density of the units is above one in the user's units."""
+
+    def units(self) -> Units | None:
+        """Visible units; None where the settings of the run say them."""
+
+    def read(self, path: Path, *, complete: bool = True) -> Rows:
+        """Rows of a file; columns and values may be missing, whole rows too unless ``complete``.
+
+        Raises:
+            UserError: The file does not fit, with column and row.
+        """
+
+    def decode(self, v: Tensor) -> Columns:
+        """Numbers of the sites, ``(n, n_sites)``, in the user's columns and words; NaN is an empty cell."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values, from which :func:`schema_of` makes it again."""
+
+
+@dataclass(frozen=True)
+class ImageSchema:
+    """Pictures: a site is a pixel, its number a grey value.
+
+    Attributes:
+        layout: Which pixels the sites are.
+        n_classes: Number of classes.
+    """
+
+    layout: PixelLayout
+    n_classes: int
+
+    @classmethod
+    def of(cls, images: ImageData) -> "ImageSchema":
+        """That of a data set."""
+        return cls(images.layout, images.n_classes)
+
+    @property
+    def n_sites(self) -> int:
+        """Number of pixels."""
+        return self.layout.n_visible
+
+    @property
+    def class_names(self) -> list[str]:
+        """The numbers of the classes."""
+        return [str(k) for k in range(self.n_classes)]
+
+    @property
+    def site_names(self) -> list[str]:
+        """``row,column`` of each pixel."""
+        pixels = (
+            range(self.layout.height * self.layout.width) if self.layout.pixels is None else self.layout.pixels
+        )
+        return [f"{pixel // self.layout.width},{pixel % self.layout.width}" for pixel in pixels]
+
+    @property
+    def entry_names(self) -> list[str]:
+        """As the sites."""
+        return self.site_names
+
+    @property
+    def log_scale(self) -> float:
+        """0: grey values are what they are."""
+        return 0.0
+
+    def units(self) -> None:
+        """The run's settings say which kind of units has the grey values."""
+        return
+
+    def read(self, path: Path, *, complete: bool = True) -> Rows:
+        """Grey values of an array of rows or of pictures, ``.npy`` or ``.npz``; NaN is missing."""
+        try:
+            found = np.load(path, allow_pickle=False)
+            array = (
+                found if isinstance(found, np.ndarray) else found["x" if "x" in found.files else found.files[0]]
+            )
+        except (OSError, ValueError, EOFError, IndexError) as error:
+            raise UserError(f"{path} cannot be read as an array of pictures: {error}") from error
+        array = array.reshape(len(array), -1) if array.ndim > 1 else array
+        if array.ndim != 2 or array.shape[1] != self.n_sites or not len(array):
+            raise UserError(f"{path} has the shape {array.shape}: expected rows of {self.n_sites} pixels.")
+        v = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+        outside = ~(((v >= 0) & (v <= 1)) | v.isnan())
+        if bool(outside.any()):
+            row, pixel = outside.nonzero()[0].tolist()
+            raise UserError(f"{path}, row {row + 1}, pixel {pixel}: {v[row, pixel]} is not a number in [0, 1].")
+        observed = None if not bool(v.isnan().any()) else ~v.isnan()
+        return Rows(v.nan_to_num(nan=0.0), torch.full((len(v),), UNLABELLED, device="cpu"), observed)
+
+    def decode(self, v: Tensor) -> Columns:
+        """Grey values by pixel."""
+        numbers = v.detach().cpu().numpy()
+        return {name: numbers[:, k] for k, name in enumerate(self.site_names)}
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        pixels = None if self.layout.pixels is None else list(self.layout.pixels)
+        size = {"height": self.layout.height, "width": self.layout.width, "pixels": pixels}
+        return {"data": "images", **size, "n_classes": self.n_classes}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "ImageSchema":
+        """The schema that was written."""
+        pixels = None if content["pixels"] is None else tuple(content["pixels"])
+        return cls(PixelLayout(content["height"], content["width"], pixels), content["n_classes"])
+
+
+def schema_of(content: Mapping[str, Any]) -> Schema:
+    """The schema that ``as_json`` wrote."""
+    kind = content.get("data")
+    require_choice("data of a schema", kind, ("images", "table"))
+    if kind == "table":
+        from memcomp_lightning.data.tables import TableSchema  # Arrow is an extra
+
+        return TableSchema.from_json(content)
+    return ImageSchema.from_json(content)

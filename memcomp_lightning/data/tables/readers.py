@@ -1,0 +1,219 @@
+"""Reads tables and arrays of any format, some rows at a time."""
+
+import csv
+import gzip
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from memcomp_lightning.data.tables.cells import EMPTY, Cells
+from memcomp_lightning.errors import UserError
+
+ROWS = 16_384
+"""Rows that are read at a time, where a format lets one choose."""
+
+
+class Opened(NamedTuple):
+    """A table that is being read.
+
+    Attributes:
+        batches: Its rows, as record batches of Arrow.
+        named: Whether the columns have names of their own; those of arrays are numbers.
+    """
+
+    batches: Iterator[Any]
+    named: bool
+
+
+def opened(path: Path, *, key: str | None = None) -> Opened:
+    """Begin to read a file, by its ending.
+
+    Args:
+        path: CSV or TSV (also .gz, .bz2), Parquet, Excel, ``.npy``, ``.npz`` (of arrays, or sparse), HDF5.
+        key: Which array of an ``.npz`` or HDF5 file; None is the only one, or ``x``.
+
+    Raises:
+        UserError: The file does not exist, is damaged, ends in the middle, or is of another kind.
+    """
+    if not path.is_file():
+        raise UserError(f"data.path={path}: there is no such file.")
+    endings = [ending.lower() for ending in path.suffixes]
+    ending = endings[-1] if endings else ""
+    if ending in (".gz", ".bz2") and len(endings) > 1:
+        ending = endings[-2]
+    readers: dict[str, Any] = {
+        ".csv": _texts,
+        ".tsv": _texts,
+        ".txt": _texts,
+        ".data": _texts,
+        ".parquet": _parquet,
+        ".xlsx": _excel,
+        ".xls": _excel,
+        ".ods": _excel,
+    }
+    if ending in readers:
+        return _checked(readers[ending](path), path)
+    if ending in (".npy", ".npz", ".h5", ".hdf5"):
+        return _checked(_array(path, ending, key), path)
+    known = ", ".join([*readers, ".npy", ".npz", ".h5", ".hdf5"])
+    raise UserError(f"data.path={path}: files that end in {ending!r} are not read; known are {known}.")
+
+
+def of_frame(frame: Any) -> Opened:
+    """A DataFrame of pandas, or a table of Arrow."""
+    table = frame if isinstance(frame, pa.Table) else pa.Table.from_pandas(frame, preserve_index=False)
+    table = table.rename_columns([str(name) for name in table.column_names])
+    return Opened(iter(table.to_batches(max_chunksize=ROWS)), True)
+
+
+def of_array(array: Any) -> Opened:
+    """A matrix of NumPy, SciPy or torch."""
+    if hasattr(array, "detach"):
+        array = array.detach().cpu().numpy()
+    if not hasattr(array, "tocsr"):
+        array = np.asarray(array)
+    if array.ndim > 2:
+        array = array.reshape(len(array), -1)
+    if array.ndim != 2:
+        raise UserError(f"an array of shape {array.shape}: expected rows and columns.")
+    return Opened(_rows_of(array), False)
+
+
+def _checked(found: Opened, path: Path) -> Opened:
+    """The same with errors that say where the file is damaged."""
+
+    def batches() -> Iterator[Any]:
+        with _damage(path):
+            yield from found.batches
+
+    return Opened(batches(), found.named)
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (pa.ArrowException, OSError, EOFError, ValueError, KeyError) as error:
+        if isinstance(error, UserError):
+            raise
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise UserError(f"{path} is damaged, or ends in the middle: {reason}") from error
+
+
+def _texts(path: Path) -> Opened:
+    """Everything as texts, so that the kind of a column does not hang on its first rows."""
+    from pyarrow import csv as reader
+
+    with _damage(path):
+        first = _first_line(path)
+    delimiter = "\t" if "\t" in first else ";" if first.count(";") > first.count(",") else ","
+    names = [name.strip() for name in next(csv.reader(io.StringIO(first), delimiter=delimiter), [])]
+    if not names:
+        raise UserError(f"{path} is empty.")
+    headed = not all(_is_number(name) or name in EMPTY for name in names)
+    if not headed:
+        names = [str(k) for k in range(len(names))]
+    twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else set()
+    if twice:
+        raise UserError(f"{path} has two columns of the name {min(twice)!r}: give each a name of its own.")
+    texts = pa.string()
+    settings: dict[str, Any] = {
+        "read_options": reader.ReadOptions(column_names=names, skip_rows=int(headed), use_threads=False),
+        "parse_options": reader.ParseOptions(delimiter=delimiter),
+        "convert_options": reader.ConvertOptions(
+            column_types=dict.fromkeys(names, texts), strings_can_be_null=False
+        ),
+    }
+
+    def batches() -> Iterator[Any]:
+        try:
+            yield from reader.open_csv(path, **settings)
+        except pa.ArrowInvalid as error:
+            if "Empty CSV" in str(error) or "no data" in str(error).lower():
+                return
+            raise
+
+    return Opened(batches(), headed)
+
+
+def _first_line(path: Path) -> str:
+    import bz2
+
+    open_text: Any = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower(), open)
+    try:
+        with open_text(path, "rt", encoding="utf-8-sig", newline="") as file:
+            return str(file.readline())
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not text in UTF-8 (byte {error.start}).") from error
+
+
+def _is_number(text: str) -> bool:
+    return bool(Cells(pa.array([text])).spell_numbers[0])
+
+
+def _parquet(path: Path) -> Opened:
+    from pyarrow import parquet
+
+    with _damage(path):
+        file = parquet.ParquetFile(path)
+    return Opened(file.iter_batches(batch_size=ROWS), True)
+
+
+def _excel(path: Path) -> Opened:
+    try:
+        import pandas as pd
+
+        frame = pd.read_excel(path, dtype=str, keep_default_na=False)
+    except ImportError as error:
+        raise UserError(f"{path}: to read Excel files, {error.msg}: pip install pandas openpyxl.") from error
+    return of_frame(frame)
+
+
+def _array(path: Path, ending: str, key: str | None) -> Opened:
+    with _damage(path):
+        if ending == ".npy":
+            return of_array(np.load(path, mmap_mode="r", allow_pickle=False))
+        if ending == ".npz":
+            return _npz(path, key)
+        try:
+            import h5py
+        except ImportError as error:
+            raise UserError(f"{path}: HDF5 needs h5py, which is not installed: pip install h5py.") from error
+        file = h5py.File(path, "r")
+        name = _chosen(list(file.keys()), key, path)
+        return Opened(_rows_of(file[name]), False)
+
+
+def _npz(path: Path, key: str | None) -> Opened:
+    with np.load(path, allow_pickle=False) as file:
+        names = list(file.files)
+        if {"indices", "indptr", "format", "shape"} <= set(names):
+            from scipy.sparse import load_npz
+
+            return of_array(load_npz(path).tocsr())
+        return of_array(file[_chosen(names, key, path)])
+
+
+def _chosen(names: list[str], key: str | None, path: Path) -> str:
+    if key is None:
+        key = next((name for name in names if len(names) == 1 or name.lower() == "x"), None)
+    if key not in names:
+        raise UserError(f"{path} holds the arrays {', '.join(names)}: choose one by data.key=NAME.")
+    return key
+
+
+def _rows_of(array: Any) -> Iterator[Any]:
+    """Record batches of a matrix, whose columns are named by their numbers."""
+    n, n_columns = array.shape[0], int(np.prod(array.shape[1:]))
+    names = [str(k) for k in range(n_columns)]
+    rows = max(1, min(ROWS, 2**22 // max(1, n_columns)))
+    for begin in range(0, n, rows):
+        part = array[begin : begin + rows]
+        part = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
+        part = np.ascontiguousarray(part.reshape(len(part), -1).T)
+        yield pa.record_batch([pa.array(column) for column in part], names=names)

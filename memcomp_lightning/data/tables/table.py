@@ -1,0 +1,319 @@
+"""Tables from files, frames and arrays, as data of a training."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+
+from memcomp_lightning import rng
+from memcomp_lightning.data.images import PixelLayout
+from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.tables.cells import Cells
+from memcomp_lightning.data.tables.find import Summary, find
+from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame, opened
+from memcomp_lightning.data.tables.schema import TableSchema
+from memcomp_lightning.errors import UserError, require, require_count
+from memcomp_lightning.models.units import Units
+
+Open = Callable[[], Opened]
+"""Begins to read a table anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class TableData:
+    """A table as a training takes it.
+
+    Attributes:
+        train, test: Rows.
+        validation: Rows; None where none are given.
+        schema: What the units are in the table.
+        name: Of the data, for reports.
+        layout: Where the columns lie in a picture; None where they are none.
+        ignored: Why each column that the model does not have is left out.
+    """
+
+    train: Rows
+    test: Rows
+    validation: Rows | None
+    schema: TableSchema
+    name: str
+    layout: PixelLayout | None = None
+    ignored: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes, 0 without labels."""
+        return self.schema.n_classes
+
+    @property
+    def n_sites(self) -> int:
+        """Columns that the model has."""
+        return self.schema.n_sites
+
+    def units(self) -> Units:
+        """Visible units for the columns."""
+        return self.schema.units()
+
+    def described(self) -> str:
+        """The columns with their kinds, for people."""
+        lines = [(column.name, column.kind, column.described) for column in self.schema.columns]
+        if self.schema.label is not None:
+            lines.append((self.schema.label.name, "label", self.schema.label.described))
+        if self.schema.weight is not None:
+            lines.append((self.schema.weight, "weight", ""))
+        lines += [(name, "ignored", reason) for name, reason in self.ignored.items()]
+        return _table(lines, self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table in a file: what ``data=table`` and ``data=arrays`` read.
+
+    The kinds of the columns are found in the file, see :func:`memcomp_lightning.data.tables.find.find`.
+
+    Args:
+        path: CSV or TSV (also .gz), Parquet, Excel, ``.npy``, ``.npz`` (arrays or sparse), HDF5.
+        columns: Kinds by column: ``binary``, ``category``, ``real``, ``spin``, ``probability`` or ``ignore``; the
+            name ``all`` stands for all others; ``label`` and ``weight`` name columns.
+        validation: A file of rows to look at while training, with the same columns.
+        test: A file of test rows; None splits off some of ``path``.
+        test_fraction: Share of the rows that is split off, in (0, 1).
+        split_seed: Seed of that split.
+        key: Which array of an ``.npz`` or HDF5 file.
+        picture: Height and width, where the columns are the pixels of a picture.
+    """
+
+    path: str | None = None
+    columns: Mapping[str, str] | str | None = None
+    validation: str | None = None
+    test: str | None = None
+    test_fraction: float = 0.1
+    split_seed: int = 0
+    key: str | None = None
+    picture: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            raise UserError("data.path names no file: type data.path=FILE, as in data.path=people.csv.")
+        in_range = isinstance(self.test_fraction, int | float) and 0 < self.test_fraction < 1
+        require(in_range, "data.test_fraction", self.test_fraction, "a number in (0, 1)")
+        require_count("data.split_seed", self.split_seed, 0)
+
+    def load(self) -> TableData:
+        """Read the files.
+
+        Raises:
+            UserError: A file, a column or a cell is not as it must be; the message names it.
+        """
+        path = Path(str(self.path))
+        files = {"validation": self.validation, "test": self.test}
+        further: dict[str, tuple[str, Open]] = {
+            name: (file, partial(opened, Path(file), key=self.key)) for name, file in files.items() if file
+        }
+        return table_data(
+            partial(opened, path, key=self.key),
+            name=path.name,
+            columns=self.columns,
+            further=further,
+            test_fraction=self.test_fraction,
+            split_seed=self.split_seed,
+            picture=self.picture,
+        )
+
+
+def table_data(
+    begin: Open,
+    *,
+    name: str,
+    columns: Mapping[str, str] | str | None = None,
+    further: Mapping[str, tuple[str, Open]] | None = None,
+    test_fraction: float = 0.1,
+    split_seed: int = 0,
+    picture: tuple[int, int] | None = None,
+) -> TableData:
+    """Find the columns of a table in one pass over its rows, and make numbers of them in a second one.
+
+    Args:
+        begin: Begins to read the training rows.
+        name: Of the data, for reports and errors.
+        columns: As of :class:`Table`.
+        further: Names and readings of the ``validation`` and ``test`` rows, where they are apart.
+        test_fraction: Share of the rows that is split off.
+        split_seed: Seed of that split.
+        picture: Height and width, where the columns are pixels.
+    """
+    further, given = further or {}, {"all": columns} if isinstance(columns, str) else dict(columns or {})
+    summaries, n, named = _summaries(begin(), name)
+    found = find(summaries, given, name, uniform=not named)
+    schema = TableSchema(tuple(found.columns), found.label, found.weight, named)
+    apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
+    layout = None if picture is None else _layout(picture, schema)
+    if "test" in apart:
+        (train,) = _split(begin(), name, schema, [n], None)
+        test = apart["test"]
+    else:
+        n_test = round(test_fraction * n)
+        allowed = f"a share that leaves at least 1 of the {n} rows on each side"
+        require(1 <= n_test < n, "data.test_fraction", test_fraction, allowed)
+        generator = rng.stream(split_seed, "test rows")
+        order = torch.randperm(n, generator=generator, device="cpu").numpy()
+        train, test = _split(begin(), name, schema, [n - n_test, n_test], order)
+    return TableData(train, test, apart.get("validation"), schema, name, layout, found.ignored)
+
+
+def data_of(table: Any, label: Any = None, *, name: str = "table", **settings: Any) -> TableData:
+    """Data of a DataFrame, a table of Arrow, or a matrix of NumPy, SciPy or torch.
+
+    Args:
+        table: The rows.
+        label: Classes of the rows, one each, -1 where there is none; None without, or with those of a column.
+        name: Of the data, for reports.
+        settings: ``columns``, ``test_fraction``, ``split_seed``, ``picture``, as of :class:`Table`.
+    """
+    is_frame = hasattr(table, "columns") or hasattr(table, "column_names")
+    begin: Open = partial(of_frame if is_frame else of_array, table)
+    if label is not None:
+        settings["columns"] = {**_named(settings.get("columns")), "label": LABEL}
+        begin = partial(_beside, begin, np.asarray(label))
+    return table_data(begin, name=name, **settings)
+
+
+LABEL = "label"
+"""Name of a column of classes that are given beside a table."""
+
+
+def read_rows(path: Path, schema: TableSchema, *, complete: bool = True, key: str | None = None) -> Rows:
+    """Rows of a file as numbers of the units of a schema; columns may be missing unless ``complete``."""
+    return _whole(opened(path, key=key), str(path), schema, complete=complete)
+
+
+def _named(columns: Mapping[str, str] | str | None) -> dict[str, str]:
+    return {"all": columns} if isinstance(columns, str) else dict(columns or {})
+
+
+def _beside(begin: Open, label: Any) -> Opened:
+    """A reading with one column more."""
+    found = begin()
+
+    def batches() -> Any:
+        first = 0
+        for batch in found.batches:
+            part = label[first : first + batch.num_rows]
+            first += batch.num_rows
+            if len(part) != batch.num_rows:
+                raise UserError(f"{len(label)} labels for more rows: expected one for each row.")
+            yield pa.record_batch([*batch.columns, pa.array(part)], names=[*batch.schema.names, LABEL])
+
+    return Opened(batches(), found.named)
+
+
+def _layout(picture: tuple[int, int], schema: TableSchema) -> PixelLayout:
+    height, width = picture
+    n = schema.n_sites
+    require(height * width == n, "data.picture", tuple(picture), f"height and width of {n} pixels, one a column")
+    alike = len({column.kind for column in schema.columns}) == 1
+    require(alike, "data.picture", tuple(picture), "null where the columns are of several kinds")
+    return PixelLayout(height, width)
+
+
+def _summaries(found: Opened, name: str) -> tuple[list[Summary], int, bool]:
+    summaries: list[Summary] = []
+    for batch in found.batches:
+        if not summaries:
+            summaries = [Summary(str(column)) for column in batch.schema.names]
+        for summary, column in zip(summaries, batch.columns, strict=True):
+            summary.add(Cells(column))
+    n = summaries[0].n if summaries else 0
+    if n < 2:
+        raise UserError(f"{name} has {n} rows: expected two or more.")
+    return summaries, n, found.named
+
+
+def _whole(found: Opened, file: str, schema: TableSchema, *, complete: bool = True) -> Rows:
+    """All rows of a file that is small enough to be joined."""
+    parts, first = [], 0
+    for batch in found.batches:
+        parts.append(schema.encode(batch, file, first, complete=complete))
+        _check_rows(parts[-1].v, file, first, required=complete)
+        first += batch.num_rows
+    if not first:
+        raise UserError(f"{file} has no rows.")
+    v = torch.from_numpy(np.concatenate([part.v for part in parts]))
+    label = torch.from_numpy(np.concatenate([part.label for part in parts]))
+    weights = [part.weight for part in parts if part.weight is not None]
+    return _rows(v, label, torch.from_numpy(np.concatenate(weights)) if weights else None)
+
+
+def _split(found: Opened, file: str, schema: TableSchema, sizes: list[int], order: Any) -> list[Rows]:
+    """Rows of a file in parts of these sizes, each written where it belongs: no table is held twice.
+
+    Args:
+        found: The reading.
+        file: Its name, for errors.
+        schema: Of the columns.
+        sizes: Of the parts.
+        order: Place of each row over all parts, one after the other; None keeps the order of the file.
+    """
+    v = [torch.empty(size, schema.n_sites, dtype=torch.float32, device="cpu") for size in sizes]
+    label = [torch.empty(size, dtype=torch.long, device="cpu") for size in sizes]
+    weight = [torch.empty(size, dtype=torch.float32, device="cpu") for size in sizes]
+    begins = np.cumsum([0, *sizes])
+    first = 0
+    for batch in found.batches:
+        part = schema.encode(batch, file, first)
+        _check_rows(part.v, file, first)
+        places = (
+            np.arange(first, first + batch.num_rows) if order is None else order[first : first + batch.num_rows]
+        )
+        for k in range(len(sizes)):
+            here = (places >= begins[k]) & (places < begins[k + 1])
+            at = torch.from_numpy(places[here] - begins[k])
+            v[k][at] = torch.from_numpy(part.v[here])
+            label[k][at] = torch.from_numpy(part.label[here])
+            if part.weight is not None:
+                weight[k][at] = torch.from_numpy(part.weight[here])
+        first += batch.num_rows
+    weighted = schema.weight is not None
+    return [_rows(v[k], label[k], weight[k] if weighted else None) for k in range(len(sizes))]
+
+
+def _rows(v: torch.Tensor, label: torch.Tensor, weight: torch.Tensor | None) -> Rows:
+    """Rows with the mask of what is missing, which becomes 0 in place."""
+    if not bool(v.sum(dtype=torch.float64).isnan()):
+        return Rows(v, label, None, weight)
+    observed = ~v.isnan()
+    return Rows(v.nan_to_num_(nan=0.0), label, observed, weight)
+
+
+def _check_rows(v: Any, file: str, first_row: int, *, required: bool = True) -> None:
+    empty = np.isnan(v).all(axis=1)
+    if required and empty.any():
+        row = first_row + int(empty.argmax()) + 1
+        raise UserError(f"{file}, row {row}: every value that the model has is missing. Leave out the row.")
+
+
+def _table(lines: list[tuple[str, str, str]], data: TableData) -> str:
+    """Aligned columns, under a line on the rows."""
+    n, n_test = data.train.n, data.test.n
+    counts = f"{n:,} rows to train on, {n_test:,} test rows"
+    if data.validation is not None:
+        counts += f", {data.validation.n:,} to look at"
+    if data.train.observed is not None:
+        share = 1 - float(data.train.observed.float().mean())
+        counts += f", {share:.1%} of the cells missing"
+    if len(lines) > MOST_LINES:
+        kinds = [kind for _, kind, _ in lines]
+        by_kind = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+        return f"{data.name}: {counts}\n  {len(lines)} columns: {by_kind}"
+    wide = [max(len(line[k]) for line in lines) for k in range(2)]
+    rows = [f"  {name:<{wide[0]}}  {kind:<{wide[1]}}  {text}".rstrip() for name, kind, text in lines]
+    return "\n".join([f"{data.name}: {counts}", *rows])
+
+
+MOST_LINES = 60
+"""Columns that are shown one by one."""

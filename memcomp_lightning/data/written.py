@@ -1,0 +1,98 @@
+"""Writes columns to a file, by its ending."""
+
+import gzip
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from memcomp_lightning.data.schema import Columns
+from memcomp_lightning.errors import UserError
+from memcomp_lightning.files import as_csv, written_whole
+
+ENDINGS = (".csv", ".csv.gz", ".tsv", ".parquet", ".npz", ".fasta")
+"""Of the files that are written."""
+
+SEQUENCE = "sequence"
+"""The column that FASTA files are made of; another one, ``name``, gives the headers."""
+
+
+def check_output(path: Path, *, overwrite: bool) -> None:
+    """Refuse, before anything is computed, a file that cannot be written or is there already.
+
+    Raises:
+        UserError: It says what to type.
+    """
+    if not path.name.lower().endswith(ENDINGS):
+        raise UserError(f"output={path}: expected a file that ends in {', '.join(ENDINGS)}.")
+    if path.is_dir() or not path.parent.is_dir():
+        raise UserError(f"output={path}: {'this is a folder' if path.is_dir() else 'there is no such folder'}.")
+    if path.exists() and not overwrite:
+        raise UserError(f"output={path}: the file is there already. Choose another, or type overwrite=true.")
+
+
+def write_columns(columns: Columns, path: Path, *, overwrite: bool = False) -> None:
+    """Write a table whole or not at all: CSV, TSV, Parquet, npz (an array a column), or FASTA.
+
+    Raises:
+        UserError: The file is there already and ``overwrite`` is false; it has no column of sequences for FASTA.
+    """
+    check_output(path, overwrite=overwrite)
+    name = path.name.lower()
+    with written_whole(path) as partial:
+        if name.endswith(".npz"):
+            with partial.open("wb") as file:
+                np.savez_compressed(file, **{key: _plain(column) for key, column in columns.items()})  # type: ignore[arg-type]
+        elif name.endswith(".parquet"):
+            _parquet(columns, partial)
+        elif name.endswith(".fasta"):
+            partial.write_text(_fasta(columns, path), encoding="utf-8")
+        else:
+            text = _text(columns, "\t" if name.endswith(".tsv") else ",")
+            packed = gzip.compress(text.encode(), mtime=0) if name.endswith(".gz") else text.encode()
+            partial.write_bytes(packed)
+
+
+def _text(columns: Columns, delimiter: str) -> str:
+    cells = [[_cell(x) for x in column.tolist()] for column in columns.values()]
+    if delimiter == ",":
+        return as_csv([list(columns), *zip(*cells, strict=True)])
+    import csv
+
+    buffer = io.StringIO()
+    csv.writer(buffer, delimiter=delimiter, lineterminator="\n").writerows(
+        [list(columns), *zip(*cells, strict=True)]
+    )
+    return buffer.getvalue()
+
+
+def _cell(x: Any) -> Any:
+    if isinstance(x, float):
+        return "" if x != x else f"{x:.7g}"
+    return "" if x is None else x
+
+
+def _plain(column: NDArray[Any]) -> NDArray[Any]:
+    """Texts as texts: objects would be pickled."""
+    if column.dtype != object:
+        return column
+    return np.array(["" if x is None else str(x) for x in column.tolist()])
+
+
+def _parquet(columns: Columns, path: Path) -> None:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError as error:
+        raise UserError("Parquet needs Arrow, which is not installed: pip install pyarrow.") from error
+    parquet.write_table(pa.table({name: pa.array(x, from_pandas=True) for name, x in columns.items()}), path)
+
+
+def _fasta(columns: Columns, path: Path) -> str:
+    if SEQUENCE not in columns:
+        raise UserError(f"output={path}: these rows are no sequences. Choose .csv, .parquet or .npz.")
+    sequences = columns[SEQUENCE].tolist()
+    names = columns["name"].tolist() if "name" in columns else [str(k + 1) for k in range(len(sequences))]
+    return "".join(f">{name}\n{sequence}\n" for name, sequence in zip(names, sequences, strict=True))
