@@ -1,0 +1,52 @@
+"""``memcomp-transform``: features of rows, the means of hidden units."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from memcomp_lightning.cli.output import say
+from memcomp_lightning.cli.products import Usage, carry_out
+from memcomp_lightning.data.written import check_output, write_columns
+from memcomp_lightning.trained import load
+from memcomp_lightning.trained.features import transform
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of ``memcomp-transform``.
+
+    Attributes:
+        output: File for the features: .csv, .tsv, .parquet or .npz.
+        overwrite: Whether a file that is there is replaced.
+        layer: Hidden layer, from 1; null is the top one.
+        replica: Which of the networks of a run with data.partitions, from 0.
+    """
+
+    output: str = "features.csv"
+    overwrite: bool = False
+    layer: int | None = None
+    replica: int | None = None
+
+
+USAGE = Usage(
+    "memcomp-transform",
+    "write the means of the hidden units for each row of a table.",
+    ("RUN", "TABLE"),
+    Settings,
+    [("memcomp-transform runs/people people.csv output=features.parquet", "features of the top layer")],
+)
+
+
+def act(places: Sequence[str], settings: Settings) -> None:
+    """Transform a file."""
+    output = Path(settings.output)
+    check_output(output, overwrite=settings.overwrite)
+    run = load(places[0], replica=settings.replica)
+    found = transform(run, run.needed_schema.read(Path(places[1]), complete=False), layer=settings.layer)
+    write_columns(found, output, overwrite=settings.overwrite)
+    say(f"{len(next(iter(found.values()))):,} rows, {len(found)} features: {output}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point."""
+    carry_out(USAGE, act, arguments)

@@ -1,0 +1,105 @@
+"""What the commands that use a trained run have in common: ``memcomp-NAME RUN [FILE] setting=value ...``."""
+
+import dataclasses
+import inspect
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from omegaconf import OmegaConf
+from yaml import YAMLError
+
+from memcomp_lightning.cli.output import refuse, say
+from memcomp_lightning.configuration.errors import in_words
+from memcomp_lightning.configuration.values import filled
+from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.modules import CheckpointError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Usage(Generic[T]):
+    """How a command is called.
+
+    Attributes:
+        command: Its name.
+        purpose: What it does, a sentence.
+        places: Names of what comes before the settings: ``("RUN",)`` or ``("RUN", "TABLE")``.
+        settings: A dataclass; its docstring's section *Attributes* explains them.
+        examples: Lines that people may type, each with what it does.
+        optional: How many of the places, from the end, may be left out.
+    """
+
+    command: str
+    purpose: str
+    places: tuple[str, ...]
+    settings: type[T]
+    examples: Sequence[tuple[str, str]] = ()
+    optional: int = 0
+
+    def read(self, arguments: Sequence[str]) -> tuple[list[str], T]:
+        """What was typed: the places, and the settings.
+
+        Raises:
+            UserError, SettingError: A place is missing, a setting does not exist or has a wrong value.
+        """
+        at = next((k for k, text in enumerate(arguments) if re.match(r"\w+=", text)), len(arguments))
+        places, pairs = list(arguments[:at]), list(arguments[at:])
+        least = len(self.places) - self.optional
+        if not least <= len(places) <= len(self.places) or not all("=" in pair for pair in pairs):
+            odd = next((pair for pair in pairs if "=" not in pair), None)
+            said = f"{odd!r} is no setting" if odd else f"{len(places)} given before the settings"
+            raise UserError(f"{said}: type {self.line}. {self.command} --help shows the settings.")
+        try:
+            settings = OmegaConf.from_dotlist(pairs)
+        except YAMLError as error:
+            raise UserError(
+                f"a value cannot be read ({' '.join(str(error).split())}): put it in quotes."
+            ) from error
+        return places, filled(self.settings, settings, self.command)
+
+    @property
+    def line(self) -> str:
+        """The command in one line."""
+        n = len(self.places) - self.optional
+        shown = [*self.places[:n], *(f"[{place}]" for place in self.places[n:])]
+        return " ".join([self.command, *shown, "[setting=value ...]"])
+
+    @property
+    def help(self) -> str:
+        """What ``--help`` prints."""
+        text = inspect.getdoc(self.settings) or ""
+        explained = inspect.cleandoc(text.partition("Attributes:\n")[2])
+        defaults = {
+            field.name: field.default
+            for field in dataclasses.fields(self.settings)  # type: ignore[arg-type]
+        }
+        lines = []
+        for line in explained.splitlines():
+            name = re.match(r"(\w+): ", line)
+            if name and name[1] in defaults:
+                value = defaults[name[1]]
+                shown = {None: "null", True: "true", False: "false"}.get(value, value)  # type: ignore[arg-type]
+                lines.append(f"  {name[1]}={shown}\n      {line[name.end() :]}")
+            else:
+                lines.append(f"      {line.strip()}")
+        examples = [f"  {typed}\n      {does}" for typed, does in self.examples]
+        return "\n".join([f"{self.command}: {self.purpose}", "", f"  {self.line}", "", *examples, "", *lines])
+
+
+def carry_out(
+    usage: Usage[T], act: Callable[[list[str], T], None], arguments: Sequence[str] | None = None
+) -> None:
+    """Read the command line, and act; what the user can put right ends the command by one line."""
+    typed = sys.argv[1:] if arguments is None else list(arguments)
+    if {"--help", "-h"} & set(typed):
+        say(usage.help)
+        return
+    try:
+        places, settings = usage.read(typed)
+        act(places, settings)
+    except (UserError, SettingError, CheckpointError, OSError) as error:
+        refuse(usage.command, UserError(in_words(error)))
