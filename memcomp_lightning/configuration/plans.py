@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 
     Data: TypeAlias = ImageData | TableData
 
-MOST_NUMBERS = 2**26
-"""Values of training data that the initial biases are read from; of more, evenly spaced rows."""
-
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
 _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
@@ -91,7 +88,7 @@ def build(config: DictConfig) -> Plan:
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
-            v, _, observed = rows.some_train(MOST_NUMBERS)
+            v, _, observed = rows.some_train()
             start_at_means(models[0], v, observed)
         schedules = _schedules(config, "pretrain")
         stage_for = instantiate(config.pretrain.stage)

@@ -1,7 +1,7 @@
 """The rows of one experiment, dealt into replicas and held-out parts, as Lightning wants them."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -61,6 +61,9 @@ class RowsDataModule(LightningDataModule):
         labels: Take the rows that have a label alone, ``"all"`` or so many of the training rows, of each class its
             share; None takes all rows.
     """
+
+    most_numbers: ClassVar[int | None] = None
+    """Values of visible units that are held at once to read means from; None is all of them."""
 
     def __init__(
         self,
@@ -160,13 +163,9 @@ class RowsDataModule(LightningDataModule):
         """Number of visible units; of categories a site has one for each state."""
         return self.units.n
 
-    def some_train(self, n_numbers: int) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Training rows, their labels and where they are known: of large data evenly spaced ones.
-
-        Args:
-            n_numbers: Values of visible units of a replica at most.
-        """
-        step = -(-self.n_train * self.n_visible // n_numbers)
+    def some_train(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Training rows, their labels and where they are known: of large tables evenly spaced ones."""
+        step = 1 if self.most_numbers is None else -(-self.n_train * self.n_visible // self.most_numbers)
         v, label, observed, weight = self._train
         if step > 1:
             v, label = v[..., ::step, :], label[..., ::step]
@@ -263,6 +262,8 @@ class TableDataModule(RowsDataModule):
         table: From :class:`memcomp_lightning.data.Table`, :meth:`from_frame` or :meth:`from_array`.
         settings: Of :class:`RowsDataModule`: ``batch_size``, ``partitions``, ``validation_fraction`` and so on.
     """
+
+    most_numbers: ClassVar[int | None] = 2**22
 
     def __init__(self, table: "TableData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}

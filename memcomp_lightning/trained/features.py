@@ -14,8 +14,8 @@ from memcomp_lightning.trained.values import complete_values
 def transform(run: Run, rows: Rows, *, layer: int | None = None) -> Columns:
     r"""Means of the hidden units of a layer given each row, as columns ``h1``, ``h2``, ...
 
-    Those of a deep belief network follow layer by layer, each from the means of the one below; of a Boltzmann machine
-    they are those of all hidden units, in the mean field.
+    Those of a deep belief network follow layer by layer, each from the means of the one below; a Boltzmann
+    machine gives those of all hidden units, in the mean field.
 
     Args:
         run: A trained run.

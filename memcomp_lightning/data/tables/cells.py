@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 EMPTY = ("", "NA", "N/A", "NaN", "nan", "null", "NULL", "None", "?")
 """Texts that stand for a missing value."""
 
+LARGEST = 1e30
+"""Of numbers: squares of them still fit single precision's range after scaling."""
+
 _NUMBER = r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$"
 
 
@@ -40,8 +43,10 @@ class Cells:
         array = self.array
         if pa.types.is_dictionary(array.type):
             array = array.dictionary_decode()
-        if pa.types.is_boolean(array.type):
-            return pc.cast(array, pa.string())
+        if pa.types.is_nested(array.type) or pa.types.is_binary(array.type):
+            raise CellError(0, "a text, a number or a date")
+        if pa.types.is_boolean(array.type) or pa.types.is_temporal(array.type):
+            array = pc.cast(array, pa.string())
         if _is_text(array.type):
             array = pc.utf8_trim_whitespace(pc.cast(array, pa.string()))
             empty = pc.is_in(array, value_set=pa.array(EMPTY))
@@ -84,9 +89,9 @@ class Cells:
                 wrong = ~self.spell_numbers & ~self.empty
                 raise CellError(int(wrong.argmax()), "a number") from None
         found: NDArray[np.float64] = pc.fill_null(plain, np.nan).to_numpy(zero_copy_only=False)
-        infinite = np.isinf(found) | (np.isnan(found) & ~self.empty)
+        infinite = (np.abs(found) > LARGEST) | (np.isnan(found) & ~self.empty)
         if infinite.any():
-            raise CellError(int(infinite.argmax()), "a finite number")
+            raise CellError(int(infinite.argmax()), f"a finite number, at most {LARGEST:g}")
         return found
 
     def index_of(self, words: Sequence[Any]) -> NDArray[np.float32]:

@@ -72,7 +72,7 @@ class Summary:
         if math.isnan(self._first):
             self._first = float(numbers[0]) - self.n
         in_turn = numbers == self._first + self.n + np.arange(len(numbers))
-        self.counts = self.counts and bool(in_turn.all())
+        self.counts = self.counts and self._first.is_integer() and bool(in_turn.all())
         x = numbers[known]
         if not len(x):
             return

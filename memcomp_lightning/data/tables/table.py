@@ -1,6 +1,6 @@
 """Tables from files, frames and arrays, as data of a training."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.data.images import PixelLayout
 from memcomp_lightning.data.rows import Rows
-from memcomp_lightning.data.tables.cells import Cells
+from memcomp_lightning.data.tables.cells import CellError, Cells
 from memcomp_lightning.data.tables.find import Summary, find
 from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame, opened
 from memcomp_lightning.data.tables.schema import TableSchema
@@ -148,7 +148,7 @@ def table_data(
         picture: Height and width, where the columns are pixels.
     """
     further, given = further or {}, {"all": columns} if isinstance(columns, str) else dict(columns or {})
-    summaries, n, named = _summaries(begin(), name)
+    summaries, n, named = _summaries(begin(), name, {column for column, kind in given.items() if kind == "ignore"})
     found = find(summaries, given, name, uniform=not named)
     schema = TableSchema(tuple(found.columns), found.label, found.weight, named)
     apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
@@ -221,13 +221,23 @@ def _layout(picture: tuple[int, int], schema: TableSchema) -> PixelLayout:
     return PixelLayout(height, width)
 
 
-def _summaries(found: Opened, name: str) -> tuple[list[Summary], int, bool]:
+def _summaries(found: Opened, name: str, skipped: Collection[str]) -> tuple[list[Summary], int, bool]:
     summaries: list[Summary] = []
     for batch in found.batches:
         if not summaries:
             summaries = [Summary(str(column)) for column in batch.schema.names]
         for summary, column in zip(summaries, batch.columns, strict=True):
-            summary.add(Cells(column))
+            if summary.name in skipped:
+                summary.n += batch.num_rows
+                continue
+            try:
+                summary.add(Cells(column))
+            except CellError as error:
+                row, cell = summary.n + error.row + 1, column[error.row].as_py()
+                raise UserError(
+                    f"{name}, column {summary.name!r}, row {row}: {cell!r} is not allowed: expected "
+                    f"{error.expected}. Type 'data.columns={{{summary.name}: ignore}}' to leave the column out."
+                ) from error
     n = summaries[0].n if summaries else 0
     if n < 2:
         raise UserError(f"{name} has {n} rows: expected two or more.")
@@ -284,7 +294,7 @@ def _split(found: Opened, file: str, schema: TableSchema, sizes: list[int], orde
 
 def _rows(v: torch.Tensor, label: torch.Tensor, weight: torch.Tensor | None) -> Rows:
     """Rows with the mask of what is missing, which becomes 0 in place."""
-    if not bool(v.sum(dtype=torch.float64).isnan()):
+    if not bool(v.sum().isnan()):
         return Rows(v, label, None, weight)
     observed = ~v.isnan()
     return Rows(v.nan_to_num_(nan=0.0), label, observed, weight)
