@@ -10,8 +10,8 @@ from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.training import FINETUNING_SGD, LOSSES, ClassifierStep, OptimizerFactory, Schedule, score
+from memcomp_lightning.training.given import Given, as_batch
 from memcomp_lightning.training.score import require_complete, score_of
-from memcomp_lightning.types import Batch
 
 
 class Classifier(StageModule):
@@ -54,19 +54,21 @@ class Classifier(StageModule):
         return self.make_optimizer(self.network.parameters())
 
     @with_gradient()
-    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
+    def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the mean loss; replicas add up and stay independent. Return the ``score``."""
         network = self.network if type(self).forward is Classifier.forward else self
+        batch = as_batch(batch)
         batch = batch._replace(v=plain(batch.v), label=plain(batch.label))
         loss, losses, logits = ClassifierStep(network, self.loss).loss(batch)
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": score_of(losses, logits, batch.label)}
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
+    def validation_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of held-out images."""
+        batch = as_batch(batch)
         require_complete(batch)
         return {"score": score(self(batch.v), batch.label, self.loss)}
 
-    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
+    def test_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of test images."""
         return self.validation_step(batch, batch_idx)

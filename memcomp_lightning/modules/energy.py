@@ -18,6 +18,7 @@ from memcomp_lightning import defaults, rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.objective import Centring, Offsets, weighted
 from memcomp_lightning.samplers import tensors_of, with_tensors
@@ -34,8 +35,9 @@ from memcomp_lightning.training import (
     Schedule,
     StepState,
 )
+from memcomp_lightning.training.given import Given, as_batch
 from memcomp_lightning.training.stages.base import check_stage
-from memcomp_lightning.types import Batch, NegativePhase
+from memcomp_lightning.types import NegativePhase
 
 CENTRED = Centring(rate=defaults.CENTRING_RATE)
 
@@ -93,6 +95,11 @@ class EnergyPretraining(StageModule):
         self._gap: Tensor | float = 0.0
         self._begun_at = [0]
         self._fewest_passes = 0
+
+    @property
+    def _units(self) -> Units:
+        """Those that the data are values of."""
+        return self.phases[0].model.visible
 
     @property
     def phases(self) -> Sequence[Phase]:
@@ -232,8 +239,9 @@ class EnergyPretraining(StageModule):
         return re.sub(rf"^{self.stage}/({tags})/", f"{self.log_prefix}/", name) if tags else name
 
     @with_gradient()
-    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, object]:
+    def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
+        batch = as_batch(batch, self._units)
         with torch.no_grad():
             v, (positive, inferred) = self.phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
@@ -261,8 +269,9 @@ class EnergyPretraining(StageModule):
             "info": {**inferred, **negative.info},
         }
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor | None]:
+    def validation_step(self, batch: Given, batch_idx: int) -> dict[str, Tensor | None]:
         """Return the model's visible states ``v`` of held-out images, and where they are known."""
+        batch = as_batch(batch, self._units)
         v, observed = self.phase.seen_of(batch, rng.stream(self.seed, "validation", batch_idx))
         return {"v": v, "observed": observed}
 

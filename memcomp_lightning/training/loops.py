@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Protocol, cast
 
 import torch
-from torch import Generator, nn
+from torch import Generator, Tensor, nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
@@ -19,11 +19,13 @@ from memcomp_lightning.objective import Centring, weighted
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import BestPass
 from memcomp_lightning.training.diverged import require_finite
+from memcomp_lightning.training.given import Given, begin_epoch, updates_of
 from memcomp_lightning.training.losses import Loss, cross_entropy
 from memcomp_lightning.training.penalties import Penalty
 from memcomp_lightning.training.schedules import OptimizerFactory, Schedule, begin_pass
 from memcomp_lightning.training.score import evaluate
 from memcomp_lightning.training.stages import Phase, PretrainingStage
+from memcomp_lightning.training.stages.base import unchanged
 from memcomp_lightning.training.step import EnergyStep, Sampler, StepState
 from memcomp_lightning.types import Batch, Configurations
 
@@ -54,7 +56,7 @@ class Pass(NamedTuple):
 
 def pretrain(
     stage: PretrainingStage,
-    batches: Batches,
+    batches: "Batches | Iterable[Given] | Tensor",
     sampler: Sampler,
     *,
     iterations: int,
@@ -68,7 +70,8 @@ def pretrain(
 
     Args:
         stage: A way of pretraining, with its network.
-        batches: Images with the network's replica axis.
+        batches: Rows with the network's replica axis: of a data module, a data loader of tensors, or a tensor,
+            which is one update a pass.
         sampler: Supplies the negative phase.
         iterations: Passes over the training set for each model, >= 0.
         optimizer: Builds the optimiser of one model, element-wise, so that replicas stay independent.
@@ -96,7 +99,7 @@ def pretrain(
             streams=streams,
         )
         for epoch in range(number * iterations, (number + 1) * iterations):
-            batches.set_epoch(epoch)
+            begin_epoch(batches, epoch)
             done = training.run_pass(batches)
             stage.hand_over()
             yield done._replace(number=epoch + 1)
@@ -126,6 +129,7 @@ class PhaseTraining:
         streams: Mapping[str, Generator],
     ) -> None:
         self.phase = phase
+        self._units = phase.model.visible if phase.visible_of is unchanged else None
         self.step = EnergyStep(sampler=sampler, centring=centring, penalties=penalties)
         self.schedules = schedules
         self.streams = streams
@@ -140,11 +144,11 @@ class PhaseTraining:
         self.step = EnergyStep(sampler=sampler, centring=centring, penalties=self.step.penalties)
 
     @with_gradient()
-    def run_pass(self, batches: Iterable[Batch]) -> Pass:
+    def run_pass(self, batches: Iterable[Given] | Tensor) -> Pass:
         """Update the model by each step of the batches, once."""
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         state, phase = self._state, self.phase
-        for batch in batches:
+        for batch in updates_of(batches, self._units):
             with torch.no_grad():
                 _, found = phase.positive_of(batch, self.streams["positive_phase"])
                 positive = weighted(found.configurations, batch.weight)
@@ -184,12 +188,12 @@ class ClassifierTraining:
         self.passes_done = 0
 
     @with_gradient()
-    def run_pass(self, batches: Iterable[Batch]) -> None:
+    def run_pass(self, batches: Iterable[Given] | Tensor) -> None:
         """Update the network by each step of the batches, once; it is in evaluation mode afterwards."""
         self.network.train()
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         step = ClassifierStep(self.network, self.loss)
-        for batch in batches:
+        for batch in updates_of(batches):
             step.add_gradient(batch)
             if batch.closes_step:
                 self.optimizer.step()
@@ -200,7 +204,7 @@ class ClassifierTraining:
 
 def finetune(
     network: nn.Module,
-    batches: Batches,
+    batches: "Batches | Iterable[Given] | Tensor",
     *,
     iterations: int,
     optimizer: OptimizerFactory,
@@ -229,7 +233,7 @@ def finetune(
     training = ClassifierTraining(network, optimizer=optimizer, schedules=schedules, loss=loss)
     best = BestPass()
     for iteration in range(iterations):
-        batches.set_epoch(iteration)
+        begin_epoch(batches, iteration)
         training.run_pass(batches)
         if keep_best_by is None:
             yield iteration + 1
