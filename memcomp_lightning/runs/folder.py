@@ -94,7 +94,14 @@ class RunFolder:
             )
 
     def keep_schema(self, schema: Mapping[str, object]) -> None:
-        """Write what the units of the model stand for."""
+        """Write what the units of the model stand for; a UserError if training began with something else."""
+        there = self.schema
+        if there is not None and there != json.loads(json.dumps(schema)):
+            raise UserError(
+                f"the data of run folder {self.path} have changed since its training began: other columns, words "
+                "or scales than in its schema.json. Choose another folder with hydra.run.dir=PATH, or bring the "
+                "data back."
+            )
         write_json(self.path / "schema.json", schema)
 
     @property

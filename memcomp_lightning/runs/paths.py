@@ -2,7 +2,9 @@
 
 import re
 
-_NAMES = re.compile(r"(.*\.)?(\w+_)?(problem|weights|path|file|filename|dir|dirpath|folder|root)")
+_NAMES = re.compile(
+    r"(.*\.)?(\w+_)?(problem|weights|path|file|filename|dir|dirpath|folder|root)|data\.(source\.)?(validation|test)"
+)
 
 
 def is_path(name: str) -> bool:

@@ -1,0 +1,163 @@
+"""Runs of ``memcomp-train data=table``: from a file to a run that is loaded, resumed and used."""
+
+import json
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import RunCommand
+from running import Outcome
+
+import memcomp_lightning
+from memcomp_lightning.errors import UserError
+from memcomp_lightning.models import RBM
+
+pytest.importorskip("pyarrow")
+
+TABLE = "id,age,sex,colour,species\n" + "".join(
+    f"{i},{20 + 7 * (i % 5) + i % 3},{'fm'[i % 2]},{['red', 'green', '', 'blue'][i % 4]},{['cat', 'dog'][i % 2]}\n"
+    for i in range(120)
+)
+QUICK = [
+    "logger=none",
+    "callbacks=minimal",
+    "model.hidden_sizes=[4]",
+    "pretrain.iterations=2",
+    "finetune.iterations=2",
+]
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture
+def command(run_command: RunCommand, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run a command in this process, in a folder."""
+
+    def run(name: str, *arguments: str, folder: Path) -> Outcome:
+        monkeypatch.chdir(folder)
+        return run_command(f"memcomp-{name}", import_module(f"memcomp_lightning.cli.{name}").main, arguments)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table."""
+    folder = tmp_path_factory.mktemp("tables")
+    (folder / "people.csv").write_text(TABLE)
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, command: Command) -> Path:
+    """The table, and two runs of it: without its gaps and with labels, with gaps and without labels."""
+    for run, columns in (("labelled", "{label: species, colour: ignore}"), ("gaps", "{species: ignore}")):
+        if not (made / run).exists():
+            settings = ["data=table", "data.path=people.csv", f"data.columns={columns}", *QUICK]
+            found = command("train", *settings, f"hydra.run.dir={run}", folder=made)
+            assert found.status == 0, found.err
+            (made / f"{run}.txt").write_text(found.out)
+    return made
+
+
+def test_the_columns_are_shown(folder: Path) -> None:
+    shown = (folder / "labelled.txt").read_text()
+    assert "108 rows to train on, 12 test rows" in shown
+    for line in (
+        "age     real",
+        "sex     binary   f, m",
+        "species  label",
+        "id       ignored  it counts the rows",
+    ):
+        assert " ".join(line.split()) in " ".join(shown.split())
+    assert "test accuracy" in shown
+    assert "accuracy" not in (folder / "gaps.txt").read_text()
+
+
+def test_a_run_is_loaded(folder: Path) -> None:
+    run = memcomp_lightning.load(folder / "labelled")
+    assert isinstance(run.model, RBM)
+    assert run.model.n_hidden == 4
+    assert run.classifier is not None
+    assert run.schema is not None
+    assert run.schema.entry_names == ["sex", "age"]
+    assert run.schema.class_names == ["cat", "dog"]
+    assert run.classifier(torch.zeros(3, 2)).shape == (3, 2)
+    alone = memcomp_lightning.load(folder / "labelled/weights/pretrain.pt")
+    assert torch.equal(alone.model.b, run.model.b)
+    assert alone.classifier is None
+    first = run.classifier[0][0]  # type: ignore[index]
+    assert not torch.equal(first.weight, run.model.weight), (
+        "fine-tuning has changed the weights of its own network"
+    )
+
+
+def test_weights_by_themselves(folder: Path, tmp_path: Path) -> None:
+    weights = folder / "gaps/weights/pretrain.pt"
+    alone = tmp_path / "alone.pt"
+    alone.write_bytes(weights.read_bytes())
+    with pytest.raises(UserError, match="the kinds of its units do not follow from them"):
+        memcomp_lightning.load(alone)
+    with pytest.raises(UserError, match="is no run folder of memcomp-train"):
+        memcomp_lightning.load(tmp_path)
+    bits = RBM(5, 3)
+    torch.save(bits.state_dict(), alone)
+    found = memcomp_lightning.load(alone)
+    assert torch.equal(found.model.c, bits.c)
+    with pytest.raises(UserError, match="a weight file alone, which does not say what its units stand for"):
+        _ = found.needed_schema
+
+
+def test_features(folder: Path, command: Command) -> None:
+    found = command("transform", "labelled", "people.csv", "output=features.csv", folder=folder)
+    assert found.status == 0, found.err
+    lines = (folder / "features.csv").read_text().splitlines()
+    assert lines[0] == "h1,h2,h3,h4"
+    assert len(lines) == 121
+    again = command("transform", "labelled", "people.csv", "output=features.csv", folder=folder)
+    assert again.status == 2
+    assert "the file is there already" in again.err
+    gaps = command("transform", "gaps", "people.csv", "output=none.csv", folder=folder)
+    assert "row 3, column 'colour' is empty: fill it first" in gaps.err
+    assert not (folder / "none.csv").exists()
+
+
+def test_a_table_that_has_changed_is_not_mixed_in(folder: Path, command: Command) -> None:
+    run = folder / "gaps"
+    (run / "result.json").rename(run / "kept.json")
+    before = (folder / "people.csv").read_text()
+    (folder / "people.csv").write_text(before + "121,99,m,violet,cat\n")
+    try:
+        found = command("train", "resume=gaps", folder=folder)
+    finally:
+        (folder / "people.csv").write_text(before)
+        (run / "kept.json").rename(run / "result.json")
+    assert found.status == 2
+    assert "have changed since its training began" in found.err
+
+
+def test_paths_are_meant_from_where_they_were_typed(folder: Path, command: Command, tmp_path: Path) -> None:
+    kept = json.loads((folder / "labelled/overrides.json").read_text())
+    assert kept["folder"] == str(folder)
+    found = command("train", f"resume={folder / 'labelled'}", folder=tmp_path)
+    assert found.status == 0, found.err
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["data=table"], "data.path names no file: type data.path=FILE"),
+        (["data=table", "data.path=none.csv"], "data.path=none.csv: there is no such file"),
+        (["data=table", "data.path=people.csv", "units=spin"], "units = "),
+        (["data=table", "data.path=people.csv", "data.paht=x"], "data.path"),
+        (["data=digits", "units=columns"], "units = 'columns' is not allowed"),
+    ],
+)
+def test_mistakes(folder: Path, command: Command, settings: list[str], message: str) -> None:
+    found = command("train", *settings, folder=folder)
+    assert found.status == 2
+    assert message in found.err
+    assert "Traceback" not in found.err
