@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import RunCommand
-from running import Outcome
+from running import QUIET, Outcome
 
 import memcomp_lightning
+from memcomp_lightning.configuration import plans
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import RBM
 
@@ -20,13 +21,7 @@ TABLE = "id,age,sex,colour,species\n" + "".join(
     f"{i},{20 + 7 * (i % 5) + i % 3},{'fm'[i % 2]},{['red', 'green', '', 'blue'][i % 4]},{['cat', 'dog'][i % 2]}\n"
     for i in range(120)
 )
-QUICK = [
-    "logger=none",
-    "callbacks=minimal",
-    "model.hidden_sizes=[4]",
-    "pretrain.iterations=2",
-    "finetune.iterations=2",
-]
+QUICK = [*QUIET, "model.hidden_sizes=[4]", "pretrain.iterations=2", "finetune.iterations=2"]
 
 
 Command = Callable[..., Outcome]
@@ -66,13 +61,8 @@ def folder(made: Path, command: Command) -> Path:
 def test_the_columns_are_shown(folder: Path) -> None:
     shown = (folder / "labelled.txt").read_text()
     assert "108 rows to train on, 12 test rows" in shown
-    for line in (
-        "age     real",
-        "sex     binary   f, m",
-        "species  label",
-        "id       ignored  it counts the rows",
-    ):
-        assert " ".join(line.split()) in " ".join(shown.split())
+    for line in ("age real", "sex binary f, m", "species label", "id ignored it counts the rows"):
+        assert line in " ".join(shown.split())
     assert "test accuracy" in shown
     assert "accuracy" not in (folder / "gaps.txt").read_text()
 
@@ -131,6 +121,7 @@ def test_a_table_that_has_changed_is_not_mixed_in(folder: Path, command: Command
     before = (folder / "people.csv").read_text()
     (folder / "people.csv").write_text(before + "121,99,m,violet,cat\n")
     try:
+        plans._load_once.cache_clear()  # as in another process
         found = command("train", "resume=gaps", folder=folder)
     finally:
         (folder / "people.csv").write_text(before)
