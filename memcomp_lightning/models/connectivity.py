@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -78,6 +79,28 @@ def from_graph(graph: Any) -> Pairs:
     number = {node: index for index, node in enumerate(sorted(graph.nodes))}
     edges = [(number[first], number[second]) for first, second in graph.edges]
     return from_pairs(len(number), torch.tensor(edges, dtype=torch.long, device="cpu").view(-1, 2))
+
+
+def from_file(path: str | Path | None, n_visible: int) -> Pairs:
+    """Edges of a text file: two numbers of units a line, from 0, by blanks or a comma; ``#`` begins a comment.
+
+    Args:
+        path: The file.
+        n_visible: Number of units that edges may join.
+
+    Raises:
+        SettingError: There is no such file, a line is something else, or a pair is not allowed.
+    """
+    path = Path(path or "")
+    require(path.is_file(), "model.connectivity.path", str(path), "a text file of edges, two numbers a line")
+    pairs = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        valid = len(words) in (0, 2) and all(word.isdecimal() for word in words)
+        require(valid, f"{path}, line {number}", line.strip(), "two numbers of units, from 0")
+        if words:
+            pairs.append((int(words[0]), int(words[1])))
+    return from_pairs(n_visible, pairs)
 
 
 def from_mask(mask: Tensor) -> Pairs:

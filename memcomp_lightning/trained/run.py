@@ -131,6 +131,9 @@ def _of_folder(path: Path, replica: int | None, *, file: Path | None = None) -> 
     there = {name: where for name, where in files.items() if where.is_file()}
     if not there:
         raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}")
+    pairs = read_checkpoint(next(iter(there.values()))).get("pairs")
+    if isinstance(pairs, Tensor) and "connectivity" in config.model:
+        config.model.connectivity = pairs.tolist()  # the file that it came from may be elsewhere
     network, classifier = _network(config, schema), None
     if "pretrain" in there:
         _take(network, there["pretrain"], n_replicas, replica)

@@ -316,7 +316,7 @@ def _table(lines: list[tuple[str, str, str]], data: TableData) -> str:
     if data.train.observed is not None:
         share = 1 - float(data.train.observed.float().mean())
         counts += f", {share:.1%} of the cells missing"
-    if len(lines) > MOST_LINES:
+    if len(lines) > MOST_LINES or not data.schema.named:
         kinds = [kind for _, kind, _ in lines]
         by_kind = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
         return f"{data.name}: {counts}\n  {len(lines)} columns: {by_kind}"
