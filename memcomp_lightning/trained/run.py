@@ -1,6 +1,6 @@
 """A trained run as objects: its model, its network, and what its units stand for."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -79,26 +79,33 @@ class Run:
         return self.schema
 
 
-def load(path: str | Path, *, network: nn.Module | None = None, replica: int | None = None) -> Run:
+def load(
+    path: str | Path,
+    *,
+    network: nn.Module | None = None,
+    replica: int | None = None,
+    trusted: Collection[str] = (),
+) -> Run:
     """Read a run folder, or a weight file.
 
-    Nothing that lies there is executed, and no data are read.
+    No data are read, and no code but this package's runs: settings that name other code are refused.
 
     Args:
         path: A run folder of ``memcomp-train``, or a file of its folder ``weights``.
         network: Takes the weights of a file that lies by itself: an RBM, a DBN, any module. DBNs and RBMs of units
             in {0, 1} follow from the tensors: leave it out.
         replica: Which of several networks that were trained side by side (``data.partitions``), from 0.
+        trusted: Packages of your own whose parts the settings may name: ``["your_package"]``.
 
     Raises:
         UserError, CheckpointError: There is no finished training; the message says what is needed.
     """
     path = Path(path)
     if path.is_dir():
-        return _of_folder(path, replica)
+        return _of_folder(path, replica, trusted)
     beside = RunFolder(path.parent.parent)
     if network is None and beside.overrides is not None and path.parent.name == "weights":
-        return _of_folder(beside.path, replica, file=path)
+        return _of_folder(beside.path, replica, trusted, file=path)
     state = read_checkpoint(path)
     if network is None:
         network = _network_of_tensors(state, path)
@@ -107,7 +114,7 @@ def load(path: str | Path, *, network: nn.Module | None = None, replica: int | N
     return Run(path, network)
 
 
-def _of_folder(path: Path, replica: int | None, *, file: Path | None = None) -> Run:
+def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, file: Path | None = None) -> Run:
     folder, written = RunFolder(path), path / "settings.yaml"
     if folder.overrides is None or not written.is_file():
         raise UserError(f"{path} is no run folder of memcomp-train: it has no settings.yaml and overrides.json.")
@@ -118,6 +125,8 @@ def _of_folder(path: Path, replica: int | None, *, file: Path | None = None) -> 
             f"with memcomp-train resume={path}"
         )
     schema, config = schema_of(content), cast(DictConfig, OmegaConf.load(written))
+    for part in ("units", "model", "finetune"):
+        _check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
     n_replicas = _n_replicas(config)
     if n_replicas is None:
         require(replica in (None, 0), "replica", replica, "0: this run has one network")
@@ -143,6 +152,26 @@ def _of_folder(path: Path, replica: int | None, *, file: Path | None = None) -> 
         _take(classifier, there["finetune"], n_replicas, replica)
     settings = cast(dict[str, Any], OmegaConf.to_container(config))
     return Run(path, network.eval(), classifier, schema, settings)
+
+
+_OWN = ("memcomp_lightning.", "torch.optim.")
+
+
+def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -> None:
+    """Refuse settings that name code of other packages: a folder may come from a stranger."""
+    if isinstance(node, dict):
+        target = node.get("_target_")
+        allowed = (*_OWN, *(f"{package}." for package in trusted))
+        if target is not None and not str(target).startswith(allowed):
+            package = str(target).partition(".")[0]
+            raise UserError(
+                f"{path}: {name} is {target}, which is code of another package. If you trust it, in Python type "
+                f"load({str(path)!r}, trusted=[{package!r}])."
+            )
+    for key, value in (
+        node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
+    ):
+        _check_targets(value, f"{name}.{key}", path, trusted)
 
 
 def _network(config: DictConfig, schema: Schema) -> nn.Module:

@@ -1,6 +1,7 @@
 """Runs of ``memcomp-train data=table``: from a file to a run that is loaded, resumed and used."""
 
 import json
+import shutil
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -99,6 +100,17 @@ def test_weights_by_themselves(folder: Path, tmp_path: Path) -> None:
     assert torch.equal(found.model.c, bits.c)
     with pytest.raises(UserError, match="a weight file alone, which does not say what its units stand for"):
         _ = found.needed_schema
+
+
+def test_code_of_others_does_not_run(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder / "labelled", copy)
+    settings = copy / "settings.yaml"
+    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Gaussian", "os.system"))
+    with pytest.raises(UserError, match=r"model\.\w+_init is os\.system, which is code of another package"):
+        memcomp_lightning.load(copy)
+    with pytest.raises(UserError, match="which is code of another package"):
+        memcomp_lightning.load(copy / "weights/pretrain.pt")
 
 
 def test_features(folder: Path, command: Command) -> None:
