@@ -2,6 +2,7 @@
 
 import gzip
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,14 @@ SEQUENCE = "sequence"
 """The column that FASTA files are made of; another one, ``name``, gives the headers."""
 
 
-def check_output(path: Path, *, overwrite: bool) -> None:
+def check_output(path: Path, *, overwrite: bool, endings: Sequence[str] = ENDINGS) -> None:
     """Refuse, before anything is computed, a file that cannot be written or is there already.
 
     Raises:
         UserError: It says what to type.
     """
-    if not path.name.lower().endswith(ENDINGS):
-        raise UserError(f"output={path}: expected a file that ends in {', '.join(ENDINGS)}.")
+    if not path.name.lower().endswith(tuple(endings)):
+        raise UserError(f"output={path}: expected a file that ends in {', '.join(endings)}.")
     if path.is_dir() or not path.parent.is_dir():
         raise UserError(f"output={path}: {'this is a folder' if path.is_dir() else 'there is no such folder'}.")
     if path.exists() and not overwrite:

@@ -91,7 +91,8 @@ def load(
     No data are read, and no code but this package's runs: settings that name other code are refused.
 
     Args:
-        path: A run folder of ``memcomp-train``, or a file of its folder ``weights``.
+        path: A run folder of ``memcomp-train``, a file of its folder ``weights``, or a ``.safetensors`` file of
+            ``memcomp-export``.
         network: Takes the weights of a file that lies by itself: an RBM, a DBN, any module. DBNs and RBMs of units
             in {0, 1} follow from the tensors: leave it out.
         replica: Which of several networks that were trained side by side (``data.partitions``), from 0.
@@ -103,6 +104,12 @@ def load(
     path = Path(path)
     if path.is_dir():
         return _of_folder(path, replica, trusted)
+    if path.suffix == ".safetensors":
+        from memcomp_lightning.trained.export.safetensors import read  # which makes runs
+
+        require(network is None, "network", type(network).__name__, "None: such a file says which it holds")
+        require(replica in (None, 0), "replica", replica, "0: such a file holds one network")
+        return read(path)
     beside = RunFolder(path.parent.parent)
     if network is None and beside.overrides is not None and path.parent.name == "weights":
         return _of_folder(beside.path, replica, trusted, file=path)
