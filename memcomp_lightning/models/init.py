@@ -73,7 +73,7 @@ def initial(shape: tuple[int, ...], weight_init: Initialiser | None, generator: 
 
 
 def independent_bias(
-    v: Images, visible: Units | None = None, observed: Tensor | None = None
+    v: Images, visible: Units | None = None, observed: Tensor | None = None, weight: Tensor | None = None
 ) -> Float[Tensor, "*axes n_visible"]:
     """Biases of units without couplings that have the data's means.
 
@@ -81,17 +81,20 @@ def independent_bias(
         v: Data.
         visible: The kind of the units; None is units in {0, 1}, of which it is log (n_on + 1) / (n_off + 1).
         observed: A mask of the values that count; None is all of them.
+        weight: How often each row counts, > 0, ``(*axes, n)``; None is once.
 
     >>> independent_bias(torch.tensor([[1.0, 0.0], [1.0, 1.0]]))
     tensor([1.0986, 0.0000])
     """
     visible = Bernoulli(v.shape[-1]) if visible is None else visible
-    total, n, _ = _sums(v, observed)
+    total, n, _ = _sums(v, observed, weight)
     return visible.bias_of(total, n)
 
 
 @torch.no_grad()
-def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None) -> None:
+def start_at_means(
+    model: EnergyModel, v: Images, observed: Tensor | None = None, weight: Tensor | None = None
+) -> None:
     """Set the visible biases of an energy model, in place, so that without couplings it has the data's means.
 
     Precisions of real units that are learned become those of the data. Hinton 2012, A Practical Guide to Training
@@ -101,6 +104,7 @@ def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None
         model: The model.
         v: Data.
         observed: A mask of the values that count; None is all of them.
+        weight: How often each row counts in the means, > 0, ``(*axes, n)``; None is once.
 
     Raises:
         SettingError: A value that the units do not take; a column of real units that is constant; a mask that
@@ -111,22 +115,26 @@ def start_at_means(model: EnergyModel, v: Images, observed: Tensor | None = None
         check_observed(model, v, observed)
     visible.check(v, observed)
     if visible.real or observed is not None:
-        total, n, variance = _sums(v, observed)
+        total, n, variance = _sums(v, observed, weight)
         visible.start(total / n, variance)
-    model.b.copy_(independent_bias(v, visible, observed).expand(model.b.shape))
+    model.b.copy_(independent_bias(v, visible, observed, weight).expand(model.b.shape))
 
 
-def _sums(v: Tensor, observed: Tensor | None) -> tuple[Tensor, float | Tensor, Tensor]:
-    """Of each column its sum, the number of values, and their variance."""
-    if observed is None:
+def _sums(
+    v: Tensor, observed: Tensor | None, weight: Tensor | None = None
+) -> tuple[Tensor, float | Tensor, Tensor]:
+    """Of each column its sum, the number of values, and their variance; weights count as repeats do."""
+    if observed is None and weight is None:
         constant = v.amax(-2) == v.amin(-2)  # its variance may be a rounding error
         return v.sum(-2), v.shape[-2], v.var(-2, correction=0).masked_fill(constant, 0.0)
-    known, n = torch.where(observed, v, 0.0), observed.sum(-2).to(v.dtype)
-    total = known.sum(-2)
-    deviation = torch.where(observed, v - (total / n.clamp(min=1)).unsqueeze(-2), 0.0)
+    observed = torch.ones_like(v, dtype=torch.bool) if observed is None else observed
+    counts = observed if weight is None else observed * weight.to(v.dtype).unsqueeze(-1)
+    known, n = torch.where(observed, v, 0.0), counts.sum(-2).to(v.dtype)
+    total, divisor = (counts * known).sum(-2), n.clamp(min=torch.finfo(v.dtype).tiny)
+    deviation = torch.where(observed, v - (total / divisor).unsqueeze(-2), 0.0)
     high = torch.where(observed, v, -torch.inf).amax(-2)
     constant = high == torch.where(observed, v, torch.inf).amin(-2)
-    return total, n, (deviation.square().sum(-2) / n.clamp(min=1)).masked_fill(constant, 0.0)
+    return total, n, ((counts * deviation.square()).sum(-2) / divisor).masked_fill(constant, 0.0)
 
 
 def _empty(shape: tuple[int, ...], generator: Generator) -> Tensor:
