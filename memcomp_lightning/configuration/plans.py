@@ -36,9 +36,9 @@ from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule
 from memcomp_lightning.training.schedules import check_schedules
 
 if TYPE_CHECKING:
-    from memcomp_lightning.data import TableData
+    from memcomp_lightning.data import SequenceData, TableData
 
-    Data: TypeAlias = ImageData | TableData
+    Data: TypeAlias = ImageData | TableData | SequenceData
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
@@ -88,8 +88,8 @@ def build(config: DictConfig) -> Plan:
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
         if initial_bias == "data" and config.model.weights is None:
-            v, _, observed = rows.some_train()
-            start_at_means(models[0], v, observed)
+            some = rows.some_train()
+            start_at_means(models[0], some.v, some.observed, some.weight)
         schedules = _schedules(config, "pretrain")
         stage_for = instantiate(config.pretrain.stage)
         try:

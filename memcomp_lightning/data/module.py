@@ -16,6 +16,7 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
 
 if TYPE_CHECKING:
+    from memcomp_lightning.data.sequences import SequenceData
     from memcomp_lightning.data.tables import TableData
 
 
@@ -93,6 +94,9 @@ class RowsDataModule(LightningDataModule):
         remedy = "Rows to look at are given: leave validation_fraction at 0."
         twice = validation is not None and validation_fraction != 0
         require(not twice, "validation_fraction", validation_fraction, "0", remedy)
+        remedy = "Rows with weights are not dealt into parts: type data.similarity=null where they are sequences, "
+        remedy += "or data.columns={NAME: ignore} where a column of a table holds them."
+        require(partitions == 1 or train.weight is None, "partitions", partitions, "1", remedy)
         n_part, n_held_out = _split(train.n, partitions, validation_fraction, partition_seed)
         n_parts = partitions
         if first_partitions is not None:
@@ -163,15 +167,16 @@ class RowsDataModule(LightningDataModule):
         """Number of visible units; of categories a site has one for each state."""
         return self.units.n
 
-    def some_train(self) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Training rows, their labels and where they are known: of large tables evenly spaced ones."""
+    def some_train(self) -> Rows:
+        """Training rows as values of the visible units: of large tables evenly spaced ones."""
         step = 1 if self.most_numbers is None else -(-self.n_train * self.n_visible // self.most_numbers)
         v, label, observed, weight = self._train
         if step > 1:
             v, label = v[..., ::step, :], label[..., ::step]
             observed = None if observed is None else observed[..., ::step, :]
+            weight = None if weight is None else weight[..., ::step]
         some = Rows(v, label, observed, weight)
-        return (*self._values(some), self._mask(some))
+        return some._replace(v=self._values(some)[0], observed=self._mask(some))
 
     def train_dataloader(self) -> Batches:
         """Return the shuffled training batches of this process."""
@@ -253,19 +258,20 @@ class ImageDataModule(RowsDataModule):
 
 
 class TableDataModule(RowsDataModule):
-    """Training, validation and test batches of a table.
+    """Training, validation and test batches of a table, or of aligned sequences.
 
     Attributes:
         table: The data, with the schema of its columns.
 
     Args:
-        table: From :class:`memcomp_lightning.data.Table`, :meth:`from_frame` or :meth:`from_array`.
+        table: From :class:`memcomp_lightning.data.Table`, :meth:`from_frame` or :meth:`from_array`; or from
+            :class:`memcomp_lightning.data.Sequences`.
         settings: Of :class:`RowsDataModule`: ``batch_size``, ``partitions``, ``validation_fraction`` and so on.
     """
 
     most_numbers: ClassVar[int | None] = 2**22
 
-    def __init__(self, table: "TableData", **settings: Any) -> None:
+    def __init__(self, table: "TableData | SequenceData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
         own |= {"validation": table.validation, "units": table.units()}
         super().__init__(table.train, table.test, **own, **settings)

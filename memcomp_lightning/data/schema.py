@@ -153,9 +153,13 @@ class ImageSchema:
 def schema_of(content: Mapping[str, Any]) -> Schema:
     """The schema that ``as_json`` wrote."""
     kind = content.get("data")
-    require_choice("data of a schema", kind, ("images", "table"))
+    require_choice("data of a schema", kind, ("images", "table", "sequences"))
     if kind == "table":
         from memcomp_lightning.data.tables import TableSchema  # Arrow is an extra
 
         return TableSchema.from_json(content)
+    if kind == "sequences":
+        from memcomp_lightning.data.sequences import SequenceSchema  # which writes columns, as defined here
+
+        return SequenceSchema.from_json(content)
     return ImageSchema.from_json(content)

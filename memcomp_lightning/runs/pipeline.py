@@ -146,7 +146,7 @@ def _record(stage: Stage) -> dict[str, Any]:
 def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     """What simple models reach on the same data; of several parts of the training set, on the first."""
     data = plan.stages[0].data
-    (train, label, observed), (heldout, _) = data.some_train(), data.heldout
+    (train, label, observed, _), (heldout, _) = data.some_train(), data.heldout
     masks = {"train_observed": observed, "observed": data.heldout_observed}
     if data.replicas:
         train, label = train[0], label[0]

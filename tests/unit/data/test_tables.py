@@ -368,7 +368,7 @@ def test_some_of_many_rows() -> None:
     module = TableDataModule.from_array(np.random.default_rng(0).normal(size=(1000, 5)))
     type(module).most_numbers, before = 1000, type(module).most_numbers
     try:
-        v, label, observed = module.some_train()
+        v, label, observed, _ = module.some_train()
     finally:
         type(module).most_numbers = before
     assert 100 <= len(v) <= 200
