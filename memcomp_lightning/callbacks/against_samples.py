@@ -17,6 +17,8 @@ from memcomp_lightning.callbacks.base import (
     tensorboards,
     write_picture,
 )
+from memcomp_lightning.data.schema import Schema
+from memcomp_lightning.data.sequences import SequenceSchema
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.models.units import Categorical, Mixed, Units
@@ -62,8 +64,13 @@ class AgainstSamples(EveryIterations):
         """Whether there is anything to draw of these visible units."""
 
     @abstractmethod
-    def figure(self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor) -> Figure:
-        """Draw data ``(n, n_visible)``, their mask, and samples ``(n_samples, n_visible)``."""
+    def figure(
+        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
+    ) -> Figure:
+        """Draw data ``(n, n_visible)``, their mask, and samples ``(n_samples, n_visible)``.
+
+        ``schema`` says what the units stand for; None where that is not known.
+        """
 
     def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
@@ -84,8 +91,20 @@ class AgainstSamples(EveryIterations):
             return
         samples = fresh_chains(model, self.n_samples, self.n_sweeps, self.seed)[..., : model.n_visible]
         mask = None if observed is None else _first(observed)
-        figure = self.figure(model.visible, _first(data), mask, _first(samples))
+        schema = schema_of_model(trainer, pl_module)
+        figure = self.figure(model.visible, _first(data), mask, _first(samples), schema)
         write_picture(trainer, pl_module, self.tag, rendered(figure))
+
+
+def schema_of_model(trainer: pl.Trainer, module: pl.LightningModule) -> Schema | None:
+    """What the visible units of the model in training stand for; None for those of an upper layer."""
+    schema: Schema | None = getattr(getattr(trainer, "datamodule", None), "schema", None)
+    return None if getattr(module, "layer", 0) else schema
+
+
+def letters_in(schema: Schema | None) -> str | None:
+    """The letters of the states, where the data have letters."""
+    return schema.letters if isinstance(schema, SequenceSchema) else None
 
 
 def kinds_in(units: Units) -> list[tuple[Units, slice]]:

@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from memcomp_lightning.callbacks.against_samples import AgainstSamples, kinds_in
+from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.plotting.densities import plot_densities
@@ -41,7 +42,9 @@ class Densities(AgainstSamples):
         """Whether some are real."""
         return units.real
 
-    def figure(self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor) -> Figure:
+    def figure(
+        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
+    ) -> Figure:
         """The histograms."""
         real = torch.cat([torch.arange(at.start, at.stop) for kind, at in kinds_in(units) if kind.real])
         seen = data if observed is None else torch.where(observed, data, torch.nan)

@@ -3,7 +3,8 @@
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from memcomp_lightning.callbacks.against_samples import AgainstSamples, frequencies, has_categories
+from memcomp_lightning.callbacks.against_samples import AgainstSamples, frequencies, has_categories, letters_in
+from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.plotting.logo import plot_logo
@@ -21,7 +22,7 @@ class Logos(AgainstSamples):
         n_samples: Chains, >= 1.
         n_sweeps: Gibbs sweeps of each chain, >= 1.
         n_sites: Most sites to draw, the first ones, >= 1.
-        alphabet: Letters of the states; None takes digits and then capitals.
+        alphabet: Letters of the states; None takes those of sequences, and else digits and then capitals.
         seed: Seed of the chains.
     """
 
@@ -44,8 +45,10 @@ class Logos(AgainstSamples):
         """Whether some are categories."""
         return has_categories(units)
 
-    def figure(self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor) -> Figure:
+    def figure(
+        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
+    ) -> Figure:
         """The logos."""
         found = {"data": frequencies(units, data, observed), "samples": frequencies(units, samples)}
         tables = {name: table[: self.n_sites].numpy() for name, table in found.items()}
-        return plot_logo(tables, alphabet=self.alphabet)
+        return plot_logo(tables, alphabet=self.alphabet or letters_in(schema))

@@ -3,7 +3,8 @@
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from memcomp_lightning.callbacks.against_samples import AgainstSamples, frequencies, has_categories
+from memcomp_lightning.callbacks.against_samples import AgainstSamples, frequencies, has_categories, letters_in
+from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.plotting.state_frequencies import plot_state_frequencies
 
@@ -19,7 +20,7 @@ class StateFrequencies(AgainstSamples):
         n_images: Training images to take, >= 1.
         n_samples: Chains, >= 1.
         n_sweeps: Gibbs sweeps of each chain, >= 1.
-        alphabet: Letters of the states; None takes digits and then capitals.
+        alphabet: Letters of the states; None takes those of sequences, and else digits and then capitals.
         seed: Seed of the chains.
     """
 
@@ -39,7 +40,9 @@ class StateFrequencies(AgainstSamples):
         """Whether some are categories."""
         return has_categories(units)
 
-    def figure(self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor) -> Figure:
+    def figure(
+        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
+    ) -> Figure:
         """The heat maps."""
         tables = [frequencies(units, data, observed).numpy(), frequencies(units, samples).numpy()]
-        return plot_state_frequencies(*tables, alphabet=self.alphabet)
+        return plot_state_frequencies(*tables, alphabet=self.alphabet or letters_in(schema))

@@ -5,7 +5,7 @@ from typing import cast
 import lightning.pytorch as pl
 import torch
 
-from memcomp_lightning.callbacks.against_samples import by_site, has_categories
+from memcomp_lightning.callbacks.against_samples import by_site, has_categories, letters_in, schema_of_model
 from memcomp_lightning.callbacks.base import EveryIterations, model_of, tensorboards, write_picture
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import RBM
@@ -22,7 +22,7 @@ class StateWeights(EveryIterations):
     Args:
         every: Passes between two pictures, >= 1.
         n_units: Most hidden units to draw, >= 1.
-        alphabet: Letters of the states; None takes digits and then capitals.
+        alphabet: Letters of the states; None takes those of sequences, and else digits and then capitals.
     """
 
     def __init__(self, every: int = 10, n_units: int = 6, alphabet: str | None = None) -> None:
@@ -42,5 +42,6 @@ class StateWeights(EveryIterations):
         norm = weight.square().nansum((-1, -2)).sqrt()
         strongest = torch.topk(norm, min(self.n_units, len(norm))).indices
         names = [f"h {unit}" for unit in strongest.tolist()]
-        figure = plot_state_weights(weight[strongest].numpy(), names, alphabet=self.alphabet)
+        alphabet = self.alphabet or letters_in(schema_of_model(trainer, pl_module))
+        figure = plot_state_weights(weight[strongest].numpy(), names, alphabet=alphabet)
         write_picture(trainer, pl_module, "state_weights", rendered(figure))
