@@ -12,6 +12,7 @@ from memcomp_lightning.configuration.plans import Shape, classifier_of, network_
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.models import DBM, DBN, EnergyModel
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules.weights import check_fits, read_checkpoint
 from memcomp_lightning.runs.folder import RunFolder
 
@@ -147,9 +148,10 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
     there = {name: where for name, where in files.items() if where.is_file()}
     if not there:
         raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}")
-    pairs = read_checkpoint(next(iter(there.values()))).get("pairs")
-    if isinstance(pairs, Tensor) and "connectivity" in config.model:
-        config.model.connectivity = pairs.tolist()  # the file that it came from may be elsewhere
+    pairs, edges = read_checkpoint(next(iter(there.values()))).get("pairs"), config.model.get("connectivity")
+    if isinstance(pairs, Tensor) and isinstance(edges, DictConfig) and "path" in edges:
+        # The file may be elsewhere. It joins sites, and pairs are those of their entries.
+        config.model.connectivity = _units_of(config, schema).site_of()[pairs].unique(dim=0).tolist()
     network, classifier = _network(config, schema), None
     if "pretrain" in there:
         _take(network, there["pretrain"], n_replicas, replica)
@@ -183,8 +185,11 @@ def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -
 
 def _network(config: DictConfig, schema: Schema) -> nn.Module:
     layout = schema.layout if isinstance(schema, ImageSchema) else getattr(schema, "layout", None)
-    units = schema.units() or units_of_settings(config, schema.n_sites)
-    return network_of(config, Shape(units, schema.n_classes, layout))
+    return network_of(config, Shape(_units_of(config, schema), schema.n_classes, layout))
+
+
+def _units_of(config: DictConfig, schema: Schema) -> Units:
+    return schema.units() or units_of_settings(config, schema.n_sites)
 
 
 def _n_replicas(config: DictConfig) -> int | None:
