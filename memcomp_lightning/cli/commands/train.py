@@ -87,6 +87,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
     if values:
+        allowed = "null where the data have no labels: accuracy on held-out rows chooses"
+        require(plans[0].finetuning is not None, "choose.setting", config.choose.setting, allowed)
         check_without_trainer(plans[0], config)
     check_trainers(plans[0], config)
 
