@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from memcomp_lightning.data.missing import split_missing
+from memcomp_lightning.data.rows import UNLABELLED
 from memcomp_lightning.errors import require, require_count
 
 
@@ -55,13 +56,13 @@ class PixelLayout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageData:
-    """A training set and a test set of labelled images.
+    """A training set and a test set of images with labels, or some of them with labels.
 
     Args:
         train_v: Intensities in [0, 1], float32, ``(n_train, n_visible)``; NaN is a missing value.
-        train_label: Class indices, int64, ``(n_train,)``.
+        train_label: Class indices, int64, -1 where an image has none, ``(n_train,)``.
         test_v: Intensities in [0, 1], float32, ``(n_test, n_visible)``.
-        test_label: Class indices, int64, ``(n_test,)``.
+        test_label: The same of the test images, ``(n_test,)``.
         n_classes: Number of classes; labels run from 0 to ``n_classes - 1``.
         layout: Where the visible units lie in the picture.
         name: Name of the data set, for reports.
@@ -130,9 +131,9 @@ def _check(subset: str, v: Tensor, label: Tensor, images: ImageData) -> None:
     require(label.dtype == torch.int64, f"{name}.dtype", label.dtype, "torch.int64", "Convert with .long().")
     allowed = f"({v.shape[0]},), one label for each image of {subset}_v"
     require(label.shape == v.shape[:1], f"{name}.shape", tuple(label.shape), allowed)
-    outside = ((label < 0) | (label >= images.n_classes)).nonzero()
+    outside = ((label < UNLABELLED) | (label >= images.n_classes)).nonzero()
     if len(outside):
         index = int(outside[0])
-        allowed = f"a class index from 0 to {images.n_classes - 1}"
+        allowed = f"a class index from 0 to {images.n_classes - 1}, or {UNLABELLED} where there is no label"
         remedy = "Number the classes from 0, or set n_classes."
         require(False, f"{name}[{index}]", label[index].item(), allowed, remedy)

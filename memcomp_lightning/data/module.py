@@ -9,8 +9,9 @@ from torch import Tensor
 
 from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
+from memcomp_lightning.data.labels import with_label, with_labels
 from memcomp_lightning.data.loading import Batches
-from memcomp_lightning.data.rows import Rows, labelled
+from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
@@ -37,6 +38,7 @@ class RowsDataModule(LightningDataModule):
     Attributes:
         replicas: Leading axes of the batches: ``()``, or the number of parts in use, ``(n,)``.
         n_train: Training rows of one replica, without those held out.
+        n_labels: Labels in use, of one replica, those of held-out rows included; None where every row's is.
         units: The kind of the visible units: ``RBM(visible=data.units, ...)``.
         n_classes: Number of classes, 0 without labels.
         data_name: Of the data, for reports.
@@ -57,10 +59,10 @@ class RowsDataModule(LightningDataModule):
             [0, 1), rounded to whole rows. With 0 the *test* rows are shown as validation set: look at
             them while training, but never choose a setting or a checkpoint by them.
         chunk_size: Rows of a replica in one Batch at most, >= 1: bounds the memory of large steps.
-        seed: Seed of the order in which training rows come.
-        partition_seed: Seed of the partition, of the held-out rows and of the labels.
-        labels: Take the rows that have a label alone, ``"all"`` or so many of the training rows, of each class its
-            share; None takes all rows.
+        seed: Seed of the order in which training rows come, and of the draw of the labels.
+        partition_seed: Seed of the partition and of the held-out rows.
+        labels: Take the rows that have a label alone, ``"all"`` or so many of them for each replica, of each class
+            its share; the held-out share of these is held out. None takes all rows.
     """
 
     most_numbers: ClassVar[int | None] = None
@@ -86,10 +88,6 @@ class RowsDataModule(LightningDataModule):
         labels: int | Literal["all"] | None = None,
     ) -> None:
         super().__init__()
-        if labels is not None:
-            train = labelled(train, None if labels == "all" else labels, n_classes, seed=partition_seed)
-            test = labelled(test, None, n_classes, seed=0)
-            validation = None if validation is None else labelled(validation, None, n_classes, seed=0)
         self.units, self.n_classes, self.data_name, self.pixel_layout = units, n_classes, name, pixel_layout
         remedy = "Rows to look at are given: leave validation_fraction at 0."
         twice = validation is not None and validation_fraction != 0
@@ -104,17 +102,27 @@ class RowsDataModule(LightningDataModule):
             n_parts = min(partitions, first_partitions)
         self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
-        self.n_train = n_part - n_held_out
-        self._train, self._test = train, test
-        self._heldout = test if validation is None else validation
         # Without parts and without a held-out set there is nothing to deal, and no copy of the rows.
+        at = heldout_at = None
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
             order = torch.randperm(train.n, generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
-            self._train = train.at(order[..., : self.n_train])
-            if n_held_out:
-                self._heldout = train.at(order[..., self.n_train :])
+            at = order[..., : n_part - n_held_out]
+            heldout_at = order[..., n_part - n_held_out :] if n_held_out else None
+        self.n_labels: int | None = None
+        if labels is not None:
+            n = None if labels == "all" else labels
+            at, heldout_at = with_labels(train.label, at, heldout_at, n, validation_fraction, seed=seed)
+            found = sum(places.shape[-1] for places in (at, heldout_at) if places is not None)
+            self.n_labels = found if 0 < found < n_part else None
+            test = with_label(test, "test rows")
+            validation = None if validation is None else with_label(validation, "rows of data.validation")
+        self._train, self._test = train if at is None else train.at(at), test
+        self._heldout = test if validation is None else validation
+        if heldout_at is not None:
+            self._heldout = train.at(heldout_at)
+        self.n_train = self._train.n
         self.train_batches(rank=0, world_size=1)
 
     @property
@@ -155,7 +163,25 @@ class RowsDataModule(LightningDataModule):
     @property
     def validation(self) -> tuple[Tensor, Tensor] | None:
         """Held-out training rows ``(*replicas, n, n_visible)`` and labels; None if none are held out."""
-        return None if self._heldout is self._test else self.heldout
+        return self.heldout if self.holds_out else None
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether there are rows to judge by beside the test rows."""
+        return self._heldout is not self._test
+
+    @property
+    def class_names(self) -> list[str]:
+        """The classes in words."""
+        return [str(k) for k in range(self.n_classes)] if self.schema is None else self.schema.class_names
+
+    @property
+    def class_totals(self) -> Tensor:
+        """Training rows of each class, over all replicas, each by its weight, ``(n_classes,)``."""
+        label, weight = self._train.label, self._train.weight
+        known = label != UNLABELLED
+        weights = None if weight is None else weight[known]
+        return torch.bincount(label[known], weights, minlength=self.n_classes)
 
     @property
     def n_at_once(self) -> int:

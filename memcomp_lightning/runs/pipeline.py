@@ -72,6 +72,8 @@ def run(
     if choice is not None:
         result["choice"] = choice
     if plan.finetuning is not None:
+        if plan.finetuning.data.n_labels is not None:
+            result["labels"] = plan.finetuning.data.n_labels
         module, data = plan.finetuning.module, plan.finetuning.data
         assert isinstance(module, Classifier)
         score = evaluate(module.network, data.test_dataloader(), module.loss)
@@ -146,19 +148,28 @@ def _record(stage: Stage) -> dict[str, Any]:
 def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     """What simple models reach on the same data; of several parts of the training set, on the first."""
     data = plan.stages[0].data
-    (train, label, observed, _), (heldout, _) = data.some_train(), data.heldout
+    (train, _, observed, _), (heldout, _) = data.some_train(), data.heldout
     masks = {"train_observed": observed, "observed": data.heldout_observed}
     if data.replicas:
-        train, label = train[0], label[0]
+        train = train[0]
         heldout = heldout if heldout.ndim == 2 else heldout[0]
         masks = {name: mask[0] if mask is not None and mask.ndim == 3 else mask for name, mask in masks.items()}
     context: dict[str, Any] = {}
     if "test_accuracy" in result:
-        accuracy = logistic_regression((train, label), data.test)
-        context["logistic_regression"] = {"test_accuracy": accuracy, "n_images": n_fitted(train)}
+        context["logistic_regression"] = _of_regression(plan)
     if any("log_likelihood" in record for record in result["stages"].values()):
         context["independent_units"] = {"heldout": independent_log_likelihood(train, heldout, data.units, **masks)}
     return context
+
+
+def _of_regression(plan: Plan) -> dict[str, Any]:
+    """What logistic regression reaches on the rows of fine-tuning; of several parts, on the first."""
+    assert plan.finetuning is not None
+    data = plan.finetuning.data
+    train, label = data.train
+    if data.replicas:
+        train, label = train[0], label[0]
+    return {"test_accuracy": logistic_regression((train, label), data.test), "n_images": n_fitted(train)}
 
 
 def _log_final(loggers: Sequence[Logger], settings: Mapping[str, object], result: dict[str, Any]) -> None:

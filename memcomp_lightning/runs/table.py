@@ -75,7 +75,9 @@ def run_table(result: dict[str, Any]) -> str:
             nats = with_error(likelihoods[layer], digits=2) if likelihoods[layer] else ""
             rows.append([f"{name} {trained}", n, with_error(gap), nats, "", ""])
         if not gaps:
-            rows.append([name, passes[0], "", "", with_error(result["test_accuracy"]), ""])
+            learnt_from = f", {result['labels']:,} labels" if "labels" in result else ""
+            accuracy = with_error(result["test_accuracy"])
+            rows.append([f"{name}{learnt_from}", passes[0], "", "", accuracy, ""])
         rows[-1][-1] = f"{record['wall_time_s']:.1f} s"
     context = result.get("context", {})
     if (independent := context.get("independent_units")) is not None:

@@ -262,7 +262,7 @@ def _shared(summary: Summary, common: Summary, file: str) -> Column:
 
 
 def _classes(summary: Summary, file: str) -> Category:
-    """The classes of a column of labels; -1 among numbers is no class."""
+    """The classes of a column of labels; -1 is no class, unless -1 and 1 are all that there is."""
     place = f"{file}, label {summary.name!r}"
     if summary.odd is None and not summary.whole:
         raise UserError(
@@ -271,7 +271,9 @@ def _classes(summary: Summary, file: str) -> Category:
         )
     if summary.distinct is None:
         raise UserError(f"{place} has more than {_KEPT} different values: too many for classes.")
-    words = tuple(word for word in summary.words if word not in (-1, "-1"))
+    words = tuple(summary.words)
+    if words != (-1, 1):
+        words = tuple(word for word in words if word not in (-1, "-1"))
     if len(words) < 2:
         raise UserError(f"{place} has {len(words)} classes, expected two or more. Leave the label out.")
     return Category(summary.name, words)

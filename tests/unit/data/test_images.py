@@ -62,7 +62,7 @@ def test_intensity_out_of_range_is_named_with_its_index(name, value):
         ImageData(**fields(**changes))
 
 
-@pytest.mark.parametrize("label", [-1, 2])
+@pytest.mark.parametrize("label", [-2, 2])
 def test_label_out_of_range_is_named_with_its_index(label):
     labels = torch.tensor([0, 1, 0, label, 1])
     with pytest.raises(SettingError, match=rf"train_label\[3\] = {label} .*from 0 to 1"):
