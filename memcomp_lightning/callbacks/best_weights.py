@@ -1,4 +1,4 @@
-"""Early stopping in hindsight: the weights of the pass that did best on held-out images."""
+"""Early stopping: the weights of the pass that did best on held-out images."""
 
 from typing import Any
 
@@ -6,19 +6,27 @@ import lightning.pytorch as pl
 import torch
 
 from memcomp_lightning.callbacks.base import required
-from memcomp_lightning.training import BestPass, Score
+from memcomp_lightning.errors import require_choice
+from memcomp_lightning.training import JUDGED_BY, BestPass, Score
 
 
 class BestWeights(pl.Callback):
-    """Keeps the weights of the pass with the highest accuracy on held-out images, and puts them back at the end.
+    """Keeps the weights of the pass that is best on held-out images, and puts them back at the end.
 
     It goes by the ``score`` that ``validation_step`` returns. Each replica keeps its own best pass, so parameters
-    must begin with the replica axes, which are those of the accuracy. Of equal passes the first one stays.
+    must begin with the replica axes, which are those of the score. Of equal passes the first one stays.
     Checkpoints hold the weights kept so far.
+
+    Args:
+        by: What is better: a higher "accuracy", or a lower "loss".
+        patience: Passes without a better one after which a replica is done, >= 1; training ends once all are. None
+            trains to the end.
     """
 
-    def __init__(self) -> None:
-        self._best = BestPass()
+    def __init__(self, *, by: str = "accuracy", patience: int | None = None) -> None:
+        require_choice("finetune.best_by", by, tuple(JUDGED_BY))
+        self.by, self.patience = by, patience
+        self._best = BestPass(patience=patience)
         self._score: Score | None = None
 
     def on_validation_epoch_start(self, *_: object) -> None:
@@ -34,13 +42,16 @@ class BestWeights(pl.Callback):
 
     @torch.no_grad()
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Keep the weights of the replicas that are better than ever."""
+        """Keep the weights of the replicas that are better than ever; ask to stop once none has patience left."""
         if self._score is None or trainer.sanity_checking:
             return
         # Every process must come to the same weights: they judge by the images of all.
-        counts = self._score.n_correct.float(), torch.tensor(float(self._score.n_images), device=pl_module.device)
-        n_correct, n_images = (trainer.strategy.reduce(count, reduce_op="sum") for count in counts)
-        self._best.offer(n_correct / n_images, pl_module.state_dict())
+        n_images = torch.tensor(float(self._score.n_images), device=pl_module.device)
+        sums = self._score.loss, self._score.n_correct.float(), n_images
+        loss, n_correct, n = (trainer.strategy.reduce(value, reduce_op="sum") for value in sums)
+        self._best.offer(JUDGED_BY[self.by](Score(loss, n_correct, n)), pl_module.state_dict())  # type: ignore[arg-type]
+        if self._best.over:
+            trainer.should_stop = True
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Put the best weights back."""
@@ -52,9 +63,11 @@ class BestWeights(pl.Callback):
         self.on_train_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
-        """Accuracies and weights."""
-        return {"accuracy": self._best.accuracy, "weights": self._best.weights}
+        """What the best pass reached, how long none was better, and its weights."""
+        best = self._best
+        return {"value": best.value, "waited": best.waited, "weights": best.weights}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
-        self._best.accuracy, self._best.weights = state_dict["accuracy"], state_dict["weights"]
+        for name, value in state_dict.items():
+            setattr(self._best, name, value)

@@ -47,7 +47,8 @@ def with_choice(config: DictConfig, value: float) -> DictConfig:
 def for_trial(config: DictConfig, value: float) -> DictConfig:
     """A copy in which the setting has this value, and images are held out to judge it by."""
     chosen = with_choice(config, value)
-    chosen.data.validation_fraction = config.data.validation_fraction or HELD_OUT
+    if config.data.get("validation") is None:
+        chosen.data.validation_fraction = config.data.validation_fraction or HELD_OUT
     return chosen
 
 

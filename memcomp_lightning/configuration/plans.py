@@ -32,7 +32,7 @@ from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
 from memcomp_lightning.studies.plan import Plan, Stage
-from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule
+from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule, balanced
 from memcomp_lightning.training.schedules import check_schedules
 
 if TYPE_CHECKING:
@@ -44,11 +44,12 @@ _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
 _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
 _DEALT = ("partitions", "first_partitions", "validation_fraction", "chunk_size")
+_STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
     "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
     "data": ("source", *_DEALT),
     "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "penalties", "stage"),
-    "finetune": (*_STAGE_SETTINGS, "loss", "units", "keep_best", "labels"),
+    "finetune": (*_STAGE_SETTINGS, "loss", "units", "labels", "class_weights", "dropout", *_STOPPING),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
@@ -107,17 +108,17 @@ def build(config: DictConfig) -> Plan:
             seed=seed,
         )
         pretraining = Stage(module, rows, callbacks)
+    labels = config.finetune.labels
+    require(labels is None or data.n_classes > 0, "finetune.labels", labels, "null for data without labels")
     if config.finetune.iterations > 0 and data.n_classes:
         layered = isinstance(network, DBN) or not models
         allowed = "0 for a Boltzmann machine, which is no feed-forward network"
         remedy = "For a deep one that is fine-tuned use model=dbn pretrain=joint."
         require(layered, "finetune.iterations", config.finetune.iterations, allowed, remedy)
-        callbacks = _callbacks(config, "finetune")
-        if config.finetune.keep_best:
-            require_held_out(config, "where finetune.keep_best is true", "pass")
-            callbacks.append(BestWeights())
-        classifier = classifier_of(config, network, data.n_classes)
-        finetuning = Stage(classifier, _data(config, "finetune", data, units), callbacks)
+        rows = _data(config, "finetune", data, units)
+        callbacks = [*_callbacks(config, "finetune"), *_judges(config, rows)]
+        classifier = classifier_of(config, network, data.n_classes, class_weights=_class_weights(config, rows))
+        finetuning = Stage(classifier, rows, callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
     allowed = "an integer >= 1 where there is no pretraining"
@@ -125,7 +126,9 @@ def build(config: DictConfig) -> Plan:
     return plan
 
 
-def classifier_of(config: DictConfig, network: nn.Module, n_classes: int) -> Classifier:
+def classifier_of(
+    config: DictConfig, network: nn.Module, n_classes: int, *, class_weights: torch.Tensor | None = None
+) -> Classifier:
     """The fine-tuning of a network."""
     schedules = _schedules(config, "finetune")
     make: Callable[..., Classifier] = partial(Classifier, network)
@@ -143,8 +146,38 @@ def classifier_of(config: DictConfig, network: nn.Module, n_classes: int) -> Cla
         optimizer=_optimizer(config, "finetune", schedules),
         schedules=schedules,
         loss=config.finetune.loss,
+        class_weights=class_weights,
+        dropout=config.finetune.get("dropout", 0.0),
         seed=config.seed,
     )
+
+
+def _judges(config: DictConfig, rows: RowsDataModule) -> list[BestWeights]:
+    """What chooses the pass that fine-tuning ends with; nothing where it is the last one."""
+    keeps, patience = config.finetune.keep_best, config.finetune.patience
+    judge = BestWeights(by=config.finetune.best_by, patience=patience)
+    if not keeps and patience is None:
+        return []
+    if not rows.holds_out:
+        which = "finetune.keep_best is true" if patience is None else "finetune.patience is set"
+        require_held_out(config, f"where {which}", "pass")
+    return [judge]
+
+
+def _class_weights(config: DictConfig, rows: RowsDataModule) -> torch.Tensor | None:
+    """How much each class counts in the loss; None is all alike."""
+    given, n = config.finetune.class_weights, rows.n_classes
+    if given is None:
+        return None
+    if given == "balanced":
+        return balanced(rows.class_totals)
+    numbers = isinstance(given, ListConfig) and all(type(weight) in (int, float) for weight in given)
+    fits = numbers and len(given) == n and all(weight > 0 for weight in given)
+    classes = ", ".join(rows.class_names[:10]) + (", ..." if n > 10 else "")
+    plain = OmegaConf.to_container(given) if isinstance(given, ListConfig) else given
+    allowed = f"null, balanced, or a list of {n} numbers > 0, one for each class: {classes}"
+    require(fits, "finetune.class_weights", plain, allowed)
+    return torch.tensor(list(given), dtype=torch.float32, device="cpu")
 
 
 def plan_of(settings: Mapping[str, object]) -> Plan:

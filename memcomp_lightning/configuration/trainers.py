@@ -13,7 +13,6 @@ from lightning.pytorch.loggers.logger import DummyLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.callbacks import BestWeights
 from memcomp_lightning.configuration.errors import explain
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.errors import UserError, require, require_count
@@ -80,9 +79,17 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
         allowed = f"at most the {n_batches} batches of a pass of {stage.module.stage}"
         remedy = "Use trainer.check_val_every_n_epoch, or null for it to count batches over passes."
         require(within or trainer.limit_val_batches == 0, "trainer.val_check_interval", every, allowed, remedy)
-        judges = any(isinstance(callback, BestWeights) for callback in stage.callbacks)
-        share, allowed = trainer.limit_val_batches, "1.0 where finetune.keep_best is true"
-        require(not judges or share == 1.0 or tries(trainer), "trainer.limit_val_batches", share, allowed)
+        judge = stage.judge
+        share, allowed = trainer.limit_val_batches, "1.0 where finetune.keep_best is true, or patience is set"
+        require(judge is None or share == 1.0 or tries(trainer), "trainer.limit_val_batches", share, allowed)
+        waits = judge is not None and judge.patience is not None and not tries(trainer)
+        allowed = "once a pass where finetune.patience, which counts passes, is set: 1.0 and 1"
+        once = every is None or (isinstance(every, float) and every == 1)
+        for name, value, each in (
+            ("val_check_interval", every, once),
+            ("check_val_every_n_epoch", passes, passes == 1),
+        ):
+            require(each or not waits, f"trainer.{name}", value, allowed)
 
 
 def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:

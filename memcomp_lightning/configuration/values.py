@@ -38,7 +38,11 @@ def check_values(settings: DictConfig) -> None:
 def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
     """Refuse a run without held-out images to choose something by."""
     share, allowed = config.data.validation_fraction, f"a share above 0 of the training images {where}"
-    require(share > 0, "data.validation_fraction", share, allowed, f"The test images would choose the {chosen}.")
+    has_file = config.data.get("validation") is not None
+    remedy = f"The test images would choose the {chosen}."
+    if "validation" in config.data:
+        remedy += " Or give rows to judge by: data.validation=FILE."
+    require(has_file or share > 0, "data.validation_fraction", share, allowed, remedy)
 
 
 def _check_finite(node: Any, name: str = "") -> None:

@@ -99,8 +99,8 @@ class MemcompEstimator(NestedSettings):
 
     def _run_passes(self, network: nn.Module, samples: Samples, held_out: Samples | None) -> None:
         """Do the passes of ``fit``; held-out samples say when to stop, and choose the weights."""
-        batches, best, n_waited = self._batches(samples), BestPass(), 0
-        scores: list[float] = []
+        batches, scores = self._batches(samples), list[float]()
+        best = BestPass(patience=self.n_iter_no_change if self.early_stopping else None, tolerance=self.tol)
         for _ in range(self.n_iter):
             self._run_pass(batches)
             score = None if held_out is None else self._score_held_out(held_out)
@@ -108,10 +108,9 @@ class MemcompEstimator(NestedSettings):
                 said = "" if score is None else f", score of held-out samples {score:.4f}"
                 print(f"[{type(self).__name__}] pass {self.n_iter_} of {self.n_iter}{said}", flush=True)
             if score is not None:
-                n_waited = 0 if score > max(scores, default=-np.inf) + self.tol else n_waited + 1
                 scores.append(score)
                 best.offer(torch.tensor(score, dtype=torch.float64), network.state_dict())
-                if n_waited >= self.n_iter_no_change:
+                if best.over:
                     break
         if held_out is not None:
             network.load_state_dict(best.weights)

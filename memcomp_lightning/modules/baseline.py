@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from torch import Generator
+from torch import Generator, Tensor
 
 from memcomp_lightning import defaults
 from memcomp_lightning.models import BatchNormReluNetwork, Initialiser
@@ -20,7 +20,7 @@ class BaselineClassifier(Classifier):
         hidden_sizes: Units of each hidden layer.
         n_classes: Size of the output layer, >= 2.
         replicas: Leading axes of independent networks.
-        iterations, optimizer, schedules, loss, seed: As for :class:`Classifier`.
+        iterations, optimizer, schedules, loss, class_weights, dropout, seed: As for :class:`Classifier`.
         weight_init: Draws all weights.
         generator: Random stream of the weights; None is a fresh stream of seed 0.
     """
@@ -36,6 +36,8 @@ class BaselineClassifier(Classifier):
         optimizer: OptimizerFactory = FINETUNING_SGD,
         schedules: Sequence[Schedule] = (),
         loss: str = "cross_entropy",
+        class_weights: Tensor | None = None,
+        dropout: float = 0.0,
         weight_init: Initialiser | None = None,
         generator: Generator | None = None,
         seed: int = 0,
@@ -44,5 +46,12 @@ class BaselineClassifier(Classifier):
             n_visible, hidden_sizes, n_classes, replicas=replicas, weight_init=weight_init, generator=generator
         )
         super().__init__(
-            network, iterations=iterations, optimizer=optimizer, schedules=schedules, loss=loss, seed=seed
+            network,
+            iterations=iterations,
+            optimizer=optimizer,
+            schedules=schedules,
+            loss=loss,
+            class_weights=class_weights,
+            dropout=dropout,
+            seed=seed,
         )

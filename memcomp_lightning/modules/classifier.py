@@ -9,7 +9,18 @@ from memcomp_lightning import defaults
 from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
-from memcomp_lightning.training import FINETUNING_SGD, LOSSES, ClassifierStep, OptimizerFactory, Schedule, score
+from memcomp_lightning.training import (
+    FINETUNING_SGD,
+    LOSSES,
+    ClassifierStep,
+    ClassWeighted,
+    Dropout,
+    Loss,
+    OptimizerFactory,
+    Schedule,
+    score,
+)
+from memcomp_lightning.training.dropout import require_share
 from memcomp_lightning.training.given import Given, as_batch
 from memcomp_lightning.training.score import require_complete, score_of
 
@@ -23,6 +34,8 @@ class Classifier(StageModule):
         optimizer: Builds the optimiser from the network's parameters.
         schedules: Change the optimiser from pass to pass.
         loss: "cross_entropy", or "squared_error" of sigmoid outputs.
+        class_weights: How much each class counts in the loss, > 0, ``(n_classes,)``; None is all alike.
+        dropout: Share of the activations of hidden layers that is left out while training, in [0, 1).
         seed: Seed of the random streams.
     """
 
@@ -36,13 +49,20 @@ class Classifier(StageModule):
         optimizer: OptimizerFactory = FINETUNING_SGD,
         schedules: Sequence[Schedule] = (),
         loss: str = "cross_entropy",
+        class_weights: Tensor | None = None,
+        dropout: float = 0.0,
         seed: int = 0,
     ) -> None:
         require_count("finetune.iterations", iterations)
         require_choice("finetune.loss", loss, tuple(LOSSES))
+        require_share(dropout)
         super().__init__(iterations=iterations, optimizer=optimizer, schedules=schedules, seed=seed)
         self.network = network
-        self.loss = LOSSES[loss]
+        self.dropout = dropout
+        if dropout:
+            self.stream_names = (*self.stream_names, "dropout")
+        plain_loss = LOSSES[loss]
+        self.loss: Loss = plain_loss if class_weights is None else ClassWeighted(plain_loss, class_weights)
 
     def forward(self, v: Tensor) -> Tensor:
         """Class logits."""
@@ -59,7 +79,8 @@ class Classifier(StageModule):
         network = self.network if type(self).forward is Classifier.forward else self
         batch = as_batch(batch)
         batch = batch._replace(v=plain(batch.v), label=plain(batch.label))
-        loss, losses, logits = ClassifierStep(network, self.loss).loss(batch)
+        dropout = Dropout(self.dropout, [self.streams["dropout"]]) if self.dropout else None
+        loss, losses, logits = ClassifierStep(network, self.loss, dropout).loss(batch)
         self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": score_of(losses, logits, batch.label)}
 

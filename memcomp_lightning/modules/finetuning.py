@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from torch import Generator, nn
+from torch import Generator, Tensor, nn
 from torch.nn import Parameter
 
 from memcomp_lightning import defaults
@@ -19,7 +19,7 @@ class DBNClassifier(Classifier):
     Args:
         dbn: The network, pretrained or not; trained in place.
         n_classes: Size of the output layer, >= 2.
-        iterations, optimizer, schedules, loss, seed: As for :class:`Classifier`.
+        iterations, optimizer, schedules, loss, class_weights, dropout, seed: As for :class:`Classifier`.
         units: Hidden units: "sigmoid", or "batch_norm_relu" for batch normalisation and ReLU on the same weights.
         output_init: Draws the weights of the output layer; None is N(0, 0.01^2).
         generator: Random stream of these weights; None is a fresh stream of seed 0.
@@ -34,6 +34,8 @@ class DBNClassifier(Classifier):
         optimizer: OptimizerFactory = FINETUNING_SGD,
         schedules: Sequence[Schedule] = (),
         loss: str = "cross_entropy",
+        class_weights: Tensor | None = None,
+        dropout: float = 0.0,
         units: Literal["sigmoid", "batch_norm_relu"] = "sigmoid",
         output_init: Initialiser | None = None,
         generator: Generator | None = None,
@@ -47,7 +49,14 @@ class DBNClassifier(Classifier):
         hidden = dbn if units == "sigmoid" else with_batch_norm_relu(dbn).to(dbn[0].weight)
         network = nn.Sequential(hidden, output.to(dbn[0].weight))
         super().__init__(
-            network, iterations=iterations, optimizer=optimizer, schedules=schedules, loss=loss, seed=seed
+            network,
+            iterations=iterations,
+            optimizer=optimizer,
+            schedules=schedules,
+            loss=loss,
+            class_weights=class_weights,
+            dropout=dropout,
+            seed=seed,
         )
         self.dbn = dbn
 

@@ -13,9 +13,16 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import stacked
-from memcomp_lightning.studies.plan import Plan, Trial, finetuning_of, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.plan import (
+    Plan,
+    Trial,
+    finetuning_of,
+    finetuning_without_trainer,
+    passes_without_trainer,
+    pretraining_of,
+)
 from memcomp_lightning.studies.records import Measures, Record
-from memcomp_lightning.training import DivergedError, evaluate, finetune
+from memcomp_lightning.training import DivergedError, evaluate
 from memcomp_lightning.types import Batch
 
 Progress = Callable[[str, int], None]
@@ -34,6 +41,8 @@ class AccuracyTrial(Trial):
         settings = self.settings
         shared = {name: settings[name] for name in ("data", "finetune", "trainer")}
         shared["network"] = [settings["model"]["_target_"], settings["model"]["hidden_sizes"]]
+        if settings["finetune"]["labels"] is not None:
+            shared["labels_of"] = self.seed
         return json.dumps(shared, sort_keys=True)
 
     def record(self, passes: Sequence[int], seconds: list[float], scores: Measures) -> Record:
@@ -100,26 +109,23 @@ class SideBySide:
         """Seconds by pass; scores by name, ``(n_passes, n_trials, n_replicas)``."""
         begin = time.perf_counter()
         stage, first = finetuning_of(plans[0])
+        seeds = [trial.seed for trial in trials]
         n_trials, replicas = len(plans), stage.data.replicas
         network = stacked([finetuning_of(plan)[1].network for plan in plans], replicas).to(device)
-        batches = stage.data.train_batches(0, 1).repeated([trial.seed for trial in trials]).to(device)
+        batches = stage.data.train_batches(0, 1).repeated(seeds).to(device)
         tests = {"test": stage.data.test, "validation": stage.data.validation}
         images = {name: _side_by_side(*held, n_trials, replicas, device) for name, held in tests.items() if held}
         scores = defaultdict(list)
         seconds = []
         n_updates = len(batches) * n_trials * math.prod(replicas)
         # Where several passes are tested, the best of these is found by the report.
-        keeps_best = trials[0].settings["finetune"]["keep_best"] and len(self.passes) == 1
+        keeps_best = stage.judge is not None and (len(self.passes) == 1 or stage.judge.patience is not None)
+        held_out = images["validation"] if keeps_best else None
+        passes = finetuning_without_trainer(
+            stage, network, batches, iterations=self.passes[-1], seeds=seeds, held_out=held_out
+        )
         try:
-            for done in finetune(
-                network,
-                batches,
-                iterations=self.passes[-1],
-                optimizer=first.make_optimizer,
-                schedules=first.schedules,
-                loss=first.loss,
-                keep_best_by=images["validation"] if keeps_best else None,
-            ):
+            for done in passes:
                 progress(f"{self.title}, pass {done} of {self.passes[-1]}", n_updates)
                 if done in self.passes:
                     seconds.append(time.perf_counter() - begin)

@@ -1,6 +1,6 @@
 """A run as objects: its network, and the stages that train it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -8,12 +8,14 @@ import lightning.pytorch as pl
 from torch import nn
 
 from memcomp_lightning import rng
+from memcomp_lightning.callbacks import BestWeights
 from memcomp_lightning.data import ImageDataModule, RowsDataModule
 from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule
 from memcomp_lightning.studies.records import Named
-from memcomp_lightning.training import Batches, Pass, PretrainingStage, pretrain
+from memcomp_lightning.training import Batches, Pass, PretrainingStage, finetune, pretrain
+from memcomp_lightning.types import Batch
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,11 @@ class Stage:
     module: StageModule
     data: RowsDataModule
     callbacks: list[pl.Callback]
+
+    @property
+    def judge(self) -> BestWeights | None:
+        """What chooses the pass to end with; None if it is the last one."""
+        return next((callback for callback in self.callbacks if isinstance(callback, BestWeights)), None)
 
 
 def passes_without_trainer(
@@ -47,6 +54,43 @@ def passes_without_trainer(
         centring=module.centring,
         penalties=module.penalties,
         seed=seed,
+    )
+
+
+def finetuning_without_trainer(
+    stage: Stage,
+    network: nn.Module,
+    batches: Batches,
+    *,
+    iterations: int,
+    seeds: Sequence[int],
+    held_out: Batch | None = None,
+) -> Iterator[int]:
+    """Train a network as the module of a stage would under a trainer; yield the passes that are done.
+
+    Args:
+        stage: Of fine-tuning.
+        network: What is trained: the module's own, or several like it side by side.
+        batches: Its images.
+        iterations: Passes.
+        seeds: Of the networks side by side.
+        held_out: What the pass to end with is judged by, if the stage keeps the best; None keeps the newest.
+    """
+    module = stage.module
+    assert isinstance(module, Classifier)
+    judge = stage.judge
+    return finetune(
+        network,
+        batches,
+        iterations=iterations,
+        optimizer=module.make_optimizer,
+        schedules=module.schedules,
+        loss=module.loss,
+        dropout=module.dropout,
+        seeds=seeds,
+        keep_best_by=None if judge is None else held_out,
+        best_by="accuracy" if judge is None else judge.by,
+        patience=None if judge is None else judge.patience,
     )
 
 

@@ -1,10 +1,11 @@
 """How models are trained: updates, stages and schedules, and loops that need no Lightning trainer."""
 
 from memcomp_lightning.training.backprop import ClassifierStep
-from memcomp_lightning.training.best import BestPass
+from memcomp_lightning.training.best import JUDGED_BY, BestPass
 from memcomp_lightning.training.diverged import DivergedError, diverged_parameter, require_finite
+from memcomp_lightning.training.dropout import Dropout
 from memcomp_lightning.training.loops import Batches, ClassifierTraining, Pass, PhaseTraining, finetune, pretrain
-from memcomp_lightning.training.losses import LOSSES, Loss, cross_entropy, squared_error
+from memcomp_lightning.training.losses import LOSSES, ClassWeighted, Loss, balanced, cross_entropy, squared_error
 from memcomp_lightning.training.penalties import L1, L2, GroupSparsity, Penalty
 from memcomp_lightning.training.schedules import (
     FINETUNING_SGD,
@@ -20,6 +21,7 @@ from memcomp_lightning.training.step import EnergyStep, Processes, Sampler, Step
 
 __all__ = [
     "FINETUNING_SGD",
+    "JUDGED_BY",
     "L1",
     "L2",
     "LOSSES",
@@ -27,9 +29,11 @@ __all__ = [
     "Batches",
     "BestPass",
     "Boltzmann",
+    "ClassWeighted",
     "ClassifierStep",
     "ClassifierTraining",
     "DivergedError",
+    "Dropout",
     "EnergyStep",
     "Greedy",
     "GroupSparsity",
@@ -48,6 +52,7 @@ __all__ = [
     "Schedule",
     "Score",
     "StepState",
+    "balanced",
     "cross_entropy",
     "diverged_parameter",
     "evaluate",

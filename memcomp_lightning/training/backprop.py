@@ -14,9 +14,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, RBM, BatchNorm, BatchNormReluNetwork, Linear
 from memcomp_lightning.models.affine import affine
-from memcomp_lightning.training.losses import Loss, cross_entropy, squared_error
+from memcomp_lightning.training.dropout import Dropout
+from memcomp_lightning.training.losses import ClassWeighted, Loss, cross_entropy, squared_error
 from memcomp_lightning.training.score import require_complete
 from memcomp_lightning.types import Batch
 
@@ -27,14 +29,25 @@ class ClassifierStep:
     Args:
         network: Maps inputs ``(*replicas, n, n_visible)`` to logits ``(*replicas, n, n_classes)``.
         loss: Of each image.
+        dropout: Leaves out activations of the hidden layers; None leaves out none.
+
+    Raises:
+        SettingError: Dropout for a network whose hidden layers are not known here.
     """
 
-    def __init__(self, network: nn.Module, loss: Loss = cross_entropy) -> None:
-        self._network, self._loss = network, loss
-        layers, of_logits = _layers_of(network), _OF_LOGITS.get(loss)
+    def __init__(self, network: nn.Module, loss: Loss = cross_entropy, dropout: Dropout | None = None) -> None:
+        self._network, self._loss, self._dropout = network, loss, dropout
+        layers = _layers_of(network)
+        of_logits = _OF_LOGITS.get(loss.loss if isinstance(loss, ClassWeighted) else loss)
         self._closed_form = (
-            None if layers is None or of_logits is None else partial(_backward_all, layers, of_logits)
+            None
+            if layers is None or of_logits is None
+            else partial(_backward_all, layers, of_logits, loss, dropout)
         )
+        if dropout is not None:
+            known = all(type(module) in _KNOWN for module in _flat(network))
+            allowed = "0 for a network of modules of your own"
+            require(known, "finetune.dropout", dropout.share, allowed, "Drop units out in the network itself.")
 
     def add_gradient(self, batch: Batch) -> None:
         """Add the gradient of ``share * mean loss``, summed over the replicas, to the parameters' ``grad``."""
@@ -49,7 +62,7 @@ class ClassifierStep:
         """Return ``share * mean loss``, summed over the replicas, to be differentiated once, losses and logits."""
         require_complete(batch)
         if self._closed_form is None:
-            logits = self._network(batch.v)
+            logits = self._logits(batch.v)
             losses = self._loss(logits, batch.label)
             return _total(losses, batch), losses.detach(), logits.detach()
         logits, found = self._closed_form(batch)
@@ -57,6 +70,16 @@ class ClassifierStep:
         parameters, gradients = zip(*found, strict=True)
         apply: Callable[..., Tensor] = _WithGradient.apply
         return apply(_total(losses, batch), gradients, *parameters), losses, logits
+
+    def _logits(self, v: Tensor) -> Tensor:
+        if self._dropout is None:
+            logits: Tensor = self._network(v)
+            return logits
+        for module in _flat(self._network):
+            v = module(v)
+            if type(module) in _BENT:
+                v = v * self._dropout.factor(v)
+        return v
 
 
 def _total(losses: Tensor, batch: Batch) -> Tensor:
@@ -110,6 +133,12 @@ Classes before images: the softmax over a last axis of ten is twenty times slowe
 """
 
 
+_BENT = (RBM, nn.ReLU)
+"""Modules that end a hidden layer."""
+
+_KNOWN = (*_BENT, Linear, BatchNorm)
+
+
 @dataclass
 class _Layer:
     """An affine map, batch normalisation or not, and what follows: nothing, the sigmoid or the ReLU."""
@@ -155,21 +184,31 @@ def _flat(network: nn.Module) -> Iterator[nn.Module]:
 
 @torch.no_grad()
 def _backward_all(
-    layers: list[_Layer], of_logits: Callable[[Tensor, Tensor], Tensor], batch: Batch
+    layers: list[_Layer],
+    of_logits: Callable[[Tensor, Tensor], Tensor],
+    loss: Loss,
+    dropout: Dropout | None,
+    batch: Batch,
 ) -> tuple[Tensor, list[tuple[Parameter, Tensor]]]:
     r"""Logits, and the gradient of each parameter: ``\delta_{l-1} = \delta_l W_l \odot f'``."""
-    below, norms = [batch.v], []
+    below, passed = [batch.v], []
     for layer in layers[:-1]:
         activation, norm = _forward(layer, below[-1])
-        below.append(activation)
-        norms.append(norm)
+        factor = None if dropout is None else dropout.factor(activation)
+        below.append(activation if factor is None else activation * factor)
+        passed.append((activation, norm, factor))
     top, found = layers[-1], []
     logits = (top.weight @ below[-1].mT).add_(top.bias.unsqueeze(-1))
-    delta = of_logits(logits, batch.label).mul_(_share_of_each(batch)).mT
+    delta = of_logits(logits, batch.label).mul_(_share_of_each(batch))
+    if isinstance(loss, ClassWeighted):
+        delta.mul_(loss.of(batch.label).unsqueeze(-2).to(delta.dtype))
+    delta = delta.mT
     for number in range(len(layers) - 1, -1, -1):
         layer = layers[number]
         if number < len(layers) - 1:
-            delta, of_norm = _backward(layer, delta, below[number + 1], norms[number])
+            activation, norm, factor = passed[number]
+            delta = delta if factor is None else delta.mul_(factor)
+            delta, of_norm = _backward(layer, delta, activation, norm)
             found += of_norm
         found += [(layer.weight, delta.mT @ below[number]), (layer.bias, delta.sum(-2))]
         if number > 0:

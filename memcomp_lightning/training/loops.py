@@ -17,8 +17,9 @@ from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import Centring, weighted
 from memcomp_lightning.training.backprop import ClassifierStep
-from memcomp_lightning.training.best import BestPass
+from memcomp_lightning.training.best import JUDGED_BY, BestPass
 from memcomp_lightning.training.diverged import require_finite
+from memcomp_lightning.training.dropout import Dropout
 from memcomp_lightning.training.given import Given, begin_epoch, updates_of
 from memcomp_lightning.training.losses import Loss, cross_entropy
 from memcomp_lightning.training.penalties import Penalty
@@ -171,6 +172,7 @@ class ClassifierTraining:
 
     Args:
         network, optimizer, schedules, loss: As for :func:`finetune`.
+        dropout: Leaves out activations of the hidden layers; None leaves out none.
     """
 
     def __init__(
@@ -180,10 +182,12 @@ class ClassifierTraining:
         optimizer: OptimizerFactory,
         schedules: Sequence[Schedule] = (),
         loss: Loss = cross_entropy,
+        dropout: Dropout | None = None,
     ) -> None:
         self.network = network
         self.schedules = schedules
         self.loss = loss
+        self.dropout = dropout
         self.optimizer = optimizer(network.parameters())
         self.passes_done = 0
 
@@ -192,7 +196,7 @@ class ClassifierTraining:
         """Update the network by each step of the batches, once; it is in evaluation mode afterwards."""
         self.network.train()
         begin_pass(self.schedules, self.optimizer, self.passes_done)
-        step = ClassifierStep(self.network, self.loss)
+        step = ClassifierStep(self.network, self.loss, self.dropout)
         for batch in updates_of(batches):
             step.add_gradient(batch)
             if batch.closes_step:
@@ -210,11 +214,16 @@ def finetune(
     optimizer: OptimizerFactory,
     schedules: Sequence[Schedule] = (),
     loss: Loss = cross_entropy,
+    dropout: float = 0.0,
+    seeds: Sequence[int] = (0,),
     keep_best_by: Batch | None = None,
+    best_by: str = "accuracy",
+    patience: int | None = None,
 ) -> Iterator[int]:
     """Minimise the loss of a network in place; yield the number of each pass once it is done.
 
-    The network is in evaluation mode while the caller has it, and nothing waits for the device in between.
+    The network is in evaluation mode while the caller has it, and nothing waits for the device in between. Once no
+    replica has patience left, the passes that follow leave it as it is.
 
     Args:
         network: Maps inputs ``(*replicas, n, n_visible)`` to logits.
@@ -223,26 +232,38 @@ def finetune(
         optimizer: Builds the optimiser, element-wise, so that replicas stay independent.
         schedules: Change the optimiser from pass to pass.
         loss: Of each image.
+        dropout: Share of the hidden activations that is left out, in [0, 1).
+        seeds: Of the streams of dropout, one for each of the trainings that the replica axis holds.
         keep_best_by: Held-out images: at each yield the network has, replica by replica, the weights of the pass
             that classified them best so far. None keeps the newest ones.
+        best_by: What is better: a higher "accuracy", or a lower "loss".
+        patience: Passes without a better one after which a replica is done, >= 1; None is never.
 
     Raises:
         DivergedError: A parameter left the finite numbers.
     """
     require_count("iterations", iterations)
-    training = ClassifierTraining(network, optimizer=optimizer, schedules=schedules, loss=loss)
-    best = BestPass()
+    device = next(network.parameters()).device
+    generators = [rng.stream(seed, "dropout", device=device) for seed in seeds]
+    left_out = Dropout(dropout, generators) if dropout else None
+    training = ClassifierTraining(network, optimizer=optimizer, schedules=schedules, loss=loss, dropout=left_out)
+    best = BestPass(patience=patience)
     for iteration in range(iterations):
+        if best.over:
+            yield iteration + 1
+            continue
         begin_epoch(batches, iteration)
         training.run_pass(batches)
         if keep_best_by is None:
             yield iteration + 1
             continue
-        best.offer(evaluate(network, [keep_best_by], loss).accuracy, network.state_dict())
+        judged = JUDGED_BY[best_by](evaluate(network, [keep_best_by], loss))
+        best.offer(judged, network.state_dict())
         newest = {name: tensor.clone() for name, tensor in network.state_dict().items()}
         network.load_state_dict(best.weights)
         yield iteration + 1
-        network.load_state_dict(newest)
+        if not best.over:
+            network.load_state_dict(newest)
     require_finite(network, "fine-tuning")
     if best.weights:
         network.load_state_dict(best.weights)

@@ -19,6 +19,7 @@ RUN = [
     "pretrain.iterations=4",
     "pretrain.batch_size=300",
     "finetune.iterations=4",
+    *("finetune.dropout=0.3", "finetune.patience=3", "data.validation_fraction=0.2"),
     "checkpoint_every=1",
     *[f"+callbacks.{stage}.kill={{_target_:killing.Kill,stage:{stage}}}" for stage in ("pretrain", "finetune")],
     "hydra.run.dir=run",

@@ -12,7 +12,7 @@ from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.modules import Classifier
 from memcomp_lightning.studies.accuracy import pretrained
-from memcomp_lightning.training import finetune
+from memcomp_lightning.studies.plan import finetuning_without_trainer
 
 Run = Callable[..., Outcome]
 ROOT = Path(__file__).parents[2]
@@ -42,6 +42,7 @@ PENALTIES = [
     f"pretrain.penalties.{name}={{_target_:memcomp_lightning.training.{kind},strength:0.01}}"
     for name, kind in (("l1", "L1"), ("l2", "L2"), ("groups", "GroupSparsity"))
 ]
+PATIENT = ["data.validation_fraction=0.2", "finetune.patience=1"]
 CASES = [
     *([f"sampler={sampler}", *SCHEDULES] for sampler in options("sampler") if sampler not in NOT_HERE),
     *([f"control={control}"] for control in options("control")),
@@ -57,6 +58,11 @@ CASES = [
     ["sampler=mode_assisted_pcd", "pretrain=joint", *SCHEDULES],
     ["control=bn_relu", "finetune.keep_best=true", "data.validation_fraction=0.2", SCHEDULES[3]],
     ["sampler=cd", "finetune.loss=squared_error", "finetune.units=batch_norm_relu", "data.partitions=2"],
+    [
+        *("control=bn_relu", "finetune.dropout=0.4", "finetune.class_weights=balanced", "finetune.labels=20"),
+        *("data.source.copies=5", "data.validation_fraction=0.3", "finetune.patience=1", "finetune.best_by=loss"),
+    ],
+    ["sampler=cd", "finetune.dropout=0.2", "finetune.optimizer.lr=1e-9", *PATIENT],
 ]
 
 
@@ -78,14 +84,13 @@ def test_a_loop_without_a_trainer_ends_with_the_weights_of_the_run(memcomp_train
     assert plan.finetuning is not None
     module, data = plan.finetuning.module, plan.finetuning.data
     assert isinstance(module, Classifier)
-    passes = finetune(
+    passes = finetuning_without_trainer(
+        plan.finetuning,
         module.network,
         data.train_batches(0, 1),
         iterations=module.iterations,
-        optimizer=module.make_optimizer,
-        schedules=module.schedules,
-        loss=module.loss,
-        keep_best_by=next(iter(data.val_dataloader())) if config.finetune.keep_best else None,
+        seeds=[config.seed],
+        held_out=next(iter(data.val_dataloader())),
     )
     assert len(list(passes)) == 3
     found = module.network.state_dict()

@@ -10,7 +10,8 @@ import torch
 from torch.utils.data import DataLoader, TensorDataset
 
 from memcomp_lightning.callbacks import BestWeights
-from memcomp_lightning.training import Score
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.training import BestPass, Score
 
 N_CORRECT = torch.tensor([[3, 5], [7, 2], [7, 8], [1, 8]])
 """Of ten held-out images, by pass and replica."""
@@ -34,14 +35,19 @@ class Counter(pl.LightningModule):
         n_correct = N_CORRECT[self.current_epoch]
         if self.weight.ndim == 1:
             n_correct = n_correct[0]
-        return {"score": Score(torch.zeros_like(n_correct).float(), n_correct, 10)}
+        return {"score": Score(10 * n_correct.float(), n_correct, 10)}
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
 def fit(
-    module: Counter, folder: Path, n_passes: int, resume_from: Path | None = None, also: Sequence[pl.Callback] = ()
+    module: Counter,
+    folder: Path,
+    n_passes: int,
+    resume_from: Path | None = None,
+    also: Sequence[pl.Callback] = (),
+    **judging: Any,
 ) -> Any:
     loader = DataLoader(TensorDataset(torch.zeros(1, 1)))
     quiet = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
@@ -49,7 +55,7 @@ def fit(
         max_epochs=n_passes,
         accelerator="cpu",
         logger=False,
-        callbacks=[BestWeights(), *also],
+        callbacks=[BestWeights(**judging), *also],
         num_sanity_val_steps=1,
         default_root_dir=folder,
         **quiet,
@@ -101,3 +107,50 @@ def test_a_run_that_stopped_after_its_last_pass_ends_with_the_best_one(tmp_path:
     module = Counter()
     fit(module, tmp_path, 4, tmp_path / "last.ckpt")
     assert module.weight.tolist() == [[2, 2, 2], [3, 3, 3]]
+
+
+def test_patience_ends_training_and_a_replica_out_of_it_takes_no_later_pass(tmp_path: Path) -> None:
+    module = Counter()
+    trainer = fit(module, tmp_path, 4, patience=1)
+    assert trainer.current_epoch == 3
+    assert module.weight.tolist() == [[2, 2, 2], [1, 1, 1]]
+    patient = Counter()
+    assert fit(patient, tmp_path, 4, patience=2).current_epoch == 4
+    assert patient.weight.tolist() == [[2, 2, 2], [3, 3, 3]]
+
+
+def test_a_lower_loss_may_be_what_is_better(tmp_path: Path) -> None:
+    module = Counter()
+    fit(module, tmp_path, 4, by="loss")
+    assert module.weight.tolist() == [[4, 4, 4], [2, 2, 2]]
+    with pytest.raises(SettingError, match=r"finetune.best_by = 'auc' .*'accuracy', 'loss'"):
+        BestWeights(by="auc")
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_patience_counts_the_passes_before_an_interruption(tmp_path: Path, at: int) -> None:
+    class StoppedError(Exception):
+        pass
+
+    class Fails(pl.Callback):
+        def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+            if trainer.current_epoch == at - 1:
+                trainer.save_checkpoint(tmp_path / "last.ckpt")
+                raise StoppedError
+
+    with pytest.raises(StoppedError):
+        fit(Counter(), tmp_path, 4, also=[Fails()], patience=1)
+    module = Counter()
+    fit(module, tmp_path, 4, tmp_path / "last.ckpt", patience=1)
+    assert module.weight.tolist() == [[2, 2, 2], [1, 1, 1]]
+
+
+def test_waiting_begins_anew_by_more_than_the_tolerance_alone() -> None:
+    best = BestPass(patience=2, tolerance=0.1)
+    for number, value in enumerate([0.5, 0.55, 0.58]):
+        assert not best.over
+        best.offer(torch.tensor(value), {"weight": torch.tensor(float(number))})
+    assert best.over
+    assert best.weights["weight"] == 2
+    with pytest.raises(SettingError, match=r"finetune.patience = 0"):
+        BestPass(patience=0)
