@@ -33,7 +33,7 @@ REFUSED = {
 }
 """Flags that would leave the checks behind, and what to do instead."""
 
-_NEVER_SWEPT = ("hydra.run.dir", "hydra.sweep.dir", "resume")
+_NEVER_SWEPT = ("hydra.run.dir", "hydra.sweep.dir", "resume", "continue")
 _SEARCH_PATH = "hydra.searchpath"
 # Code points, as many of these signs look like others: dashes and the minus sign; quotation marks.
 _DASHES = "".join(map(chr, (*range(0x2010, 0x2016), 0x2212, 0xFE58, 0xFE63, 0xFF0D)))

@@ -5,6 +5,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from functools import lru_cache, partial
 from operator import methodcaller
 from pathlib import Path
@@ -19,10 +20,12 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
+from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.values import check_values, require_held_out
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, RowsDataModule, TableDataModule
+from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import SettingError, UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
 from memcomp_lightning.models.units import Units
@@ -42,7 +45,7 @@ if TYPE_CHECKING:
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
-_OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every")
+_OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every", "continue")
 _DEALT = ("partitions", "first_partitions", "validation_fraction", "chunk_size")
 _STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
@@ -73,10 +76,15 @@ def build(config: DictConfig) -> Plan:
     for name, values in config.tried.items():
         numbers = isinstance(values, ListConfig) and all(isinstance(x, int | float) for x in values)
         require(numbers, f"tried.{name}", values, "a list of numbers")
-    data = _loaded(config)
+    earlier = earlier_of(config)
+    data = _loaded(config, None if earlier is None else earlier.schema)
+    if earlier is not None:
+        earlier.check_data(ImageSchema.of(data) if isinstance(data, ImageData) else data.schema)
     shape = shape_of(data, config)
     units = shape.units
     network = network_of(config, shape)
+    if earlier is not None and earlier.weights == "pretrain":
+        earlier.give(network)
     for stage in ("pretrain", "finetune"):
         require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
     pretraining = finetuning = stage_for = None
@@ -88,7 +96,7 @@ def build(config: DictConfig) -> Plan:
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
         initial_bias = config.pretrain.initial_bias
         require_choice("pretrain.initial_bias", initial_bias, ("data", "zero"))
-        if initial_bias == "data" and config.model.weights is None:
+        if initial_bias == "data" and config.model.weights is None and earlier is None:
             some = rows.some_train()
             start_at_means(models[0], some.v, some.observed, some.weight)
         schedules = _schedules(config, "pretrain")
@@ -106,6 +114,7 @@ def build(config: DictConfig) -> Plan:
             centring=centring,
             penalties=_penalties(config),
             seed=seed,
+            earlier=None if earlier is None else earlier.chains(),
         )
         pretraining = Stage(module, rows, callbacks)
     labels = config.finetune.labels
@@ -118,6 +127,8 @@ def build(config: DictConfig) -> Plan:
         rows = _data(config, "finetune", data, units)
         callbacks = [*_callbacks(config, "finetune"), *_judges(config, rows)]
         classifier = classifier_of(config, network, data.n_classes, class_weights=_class_weights(config, rows))
+        if earlier is not None and earlier.weights == "finetune":
+            earlier.give(classifier.network)
         finetuning = Stage(classifier, rows, callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
     plan = Plan(network, pretraining, finetuning, between, stage_for)
@@ -190,6 +201,8 @@ def check_without_trainer(plan: Plan, config: DictConfig) -> None:
     for stage in plan.stages:
         for callback in stage.callbacks:
             check_bare_loop(callback, f"callbacks.{stage.module.stage}")
+    allowed = "null: figures, comparisons and choices train new networks"
+    require(config.get("continue") is None, "continue", config.get("continue"), allowed)
     max_time = config.trainer.get("max_time")
     allowed = "null: figures, comparisons and choices train without a trainer"
     require(max_time is None, "trainer.max_time", max_time, allowed)
@@ -377,10 +390,12 @@ def _callbacks(config: DictConfig, stage: str) -> list[pl.Callback]:
     return callbacks
 
 
-def _loaded(config: DictConfig) -> "Data":
-    """The data of a run; what is not images has a schema of its own."""
+def _loaded(config: DictConfig, schema: Schema | None = None) -> "Data":
+    """The data of a run; what is not images has a schema of its own, or takes that of an earlier run."""
     source = instantiate(config.data.source)
     require_parts("data.source", source, "source of data", ("load",))
+    if schema is not None and hasattr(source, "schema"):
+        source = replace(source, schema=schema)
     data = _load_once(source) if isinstance(source, Hashable) else source.load()
     is_data, kind = isinstance(data, ImageData) or hasattr(data, "schema"), type(data).__name__
     require(is_data, "data.source", kind, "a load() that returns an ImageData, or data with a schema")

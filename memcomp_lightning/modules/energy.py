@@ -1,9 +1,10 @@
 """Pretraining under a trainer: the energy models of a stage, one after the other."""
 
+import logging
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
@@ -34,12 +35,16 @@ from memcomp_lightning.training import (
     Sampler,
     Schedule,
     StepState,
+    kept_of,
+    state_of,
 )
 from memcomp_lightning.training.given import Given, as_batch
 from memcomp_lightning.training.stages.base import check_stage
 from memcomp_lightning.types import NegativePhase
 
 CENTRED = Centring(rate=defaults.CENTRING_RATE)
+
+log = logging.getLogger(__name__)
 
 
 class EnergyPretraining(StageModule):
@@ -58,8 +63,11 @@ class EnergyPretraining(StageModule):
         centring: Settings of the centred gradient; None follows the plain one.
         penalties: What the couplings cost, beside the contrast: ``[L1(1e-3)]``.
         seed: Seed of the random streams.
+        earlier: What an earlier training of these models left, :meth:`left`: its chains and centres are kept where
+            they fit, and its random streams go on if the seed is the same. None begins anew.
 
     Attributes:
+        chains: What became of the earlier training's chains, in words, by phase.
         energy_gaps: For each model begun, mean energy of the data less that of the negative phase, in its newest
             update, ``(*replicas,)``: the contrast.
     """
@@ -78,6 +86,7 @@ class EnergyPretraining(StageModule):
         centring: Centring | None = CENTRED,
         penalties: Sequence[Penalty] = (),
         seed: int = 0,
+        earlier: Mapping[str, Any] | None = None,
     ) -> None:
         require_count("pretrain.iterations", iterations)
         require_sampler("sampler", sampler)
@@ -90,6 +99,9 @@ class EnergyPretraining(StageModule):
         self.sampler = sampler
         self.centring = centring
         self.penalties = penalties
+        self.earlier = earlier
+        self.chains: dict[str, str] = {}
+        self._left: dict[str, Any] = {}
         self.energy_gaps: list[Tensor] = []
         self._state = StepState()
         self._gap: Tensor | float = 0.0
@@ -114,7 +126,18 @@ class EnergyPretraining(StageModule):
     def record(self) -> dict[str, object]:
         """What the stage did, as plain values, with the energy gaps and the names of the models."""
         gaps = [gap.reshape(-1).tolist() for gap in self.energy_gaps]
-        return {**super().record(), "energy_gap": gaps, "trained": [phase.name for phase in self.phases]}
+        found = {"energy_gap": gaps, "trained": [phase.name for phase in self.phases]}
+        return {**super().record(), **found, **({"chains": self.chains} if self.chains else {})}
+
+    def left(self) -> dict[str, Any] | None:
+        """What a training that goes on from this one needs beside the weights: tensors in dicts; None without.
+
+        Of several processes each has chains of its own: they are not kept.
+        """
+        if not self._left or self.trainer.world_size > 1:
+            return None
+        left = {"seed": self.seed, "streams": rng.save(self.streams), "models": self._left}
+        return cast(dict[str, Any], move_data_to_device(left, "cpu"))
 
     @property
     def models(self) -> list[EnergyModel]:
@@ -188,10 +211,12 @@ class EnergyPretraining(StageModule):
         """Begin with the first model."""
         super().setup(stage)
         if stage == "fit":
-            self._begun_at, self.energy_gaps = [0], []
+            self._begun_at, self.energy_gaps, self.chains, self._left = [0], [], {}, {}
 
     def on_train_start(self) -> None:
-        """Take back the state of a checkpoint."""
+        """Take back the state of a checkpoint, or the random streams of an earlier training."""
+        if self._loaded is None and self.earlier is not None and self.earlier["seed"] == self.seed:
+            rng.restore(self.streams, self.earlier["streams"])
         fewest = self.trainer.min_epochs or 0
         self._fewest_passes = 0 if fewest == sys.maxsize else fewest
         super().on_train_start()
@@ -200,6 +225,7 @@ class EnergyPretraining(StageModule):
     def on_train_epoch_start(self) -> None:
         """A new model starts without chains, and nothing has asked to stop its training."""
         if self._next_is_due:
+            self._keep(self.phases[self.layer - 1])
             # The trainer would end the stage otherwise.
             self.trainer.should_stop = False
             self._begun_at.append(self.current_epoch)
@@ -225,6 +251,7 @@ class EnergyPretraining(StageModule):
     def on_train_end(self) -> None:
         """Give the trainer its own setting back, and the network the weights that a callback chose."""
         super().on_train_end()
+        self._keep(self.phase)
         self.pretraining.hand_over()
         self.trainer.fit_loop.min_epochs = self._fewest_passes
 
@@ -232,6 +259,26 @@ class EnergyPretraining(StageModule):
         """Tell the trainer from which pass on it may stop."""
         is_last = len(self._begun_at) == len(self.phases)
         self.trainer.fit_loop.min_epochs = self._begun_at[-1] + self._fewest_passes if is_last else sys.maxsize
+
+    def _keep(self, phase: Phase) -> None:
+        if self._state.sampler is not None:
+            self._left[phase.name] = kept_of(self._state, self._step())
+
+    def _step(self) -> EnergyStep:
+        processes = _OfTrainer(self.trainer, self.device) if self.trainer.world_size > 1 else Processes()
+        return EnergyStep(
+            sampler=self.sampler, centring=self.centring, penalties=self.penalties, processes=processes
+        )
+
+    def _go_on(self, step: EnergyStep, n: int) -> None:
+        """Begin with what an earlier training left."""
+        assert self.earlier is not None
+        kept, said = self.earlier["models"].get(self.phase.name), "begin anew, because none were kept"
+        if kept is not None and self.trainer.world_size == 1:
+            generator = rng.stream(self.seed, "check")
+            self._state, said = state_of(kept, step, self.model, n, generator=generator)
+        self.chains[self.phase.name] = said
+        log.info("The chains of %s %s.", self.phase.name, said)
 
     def monitored(self, name: str) -> str:
         """The tag to monitor now: ``pretrain/layer1/x`` becomes ``pretrain/layer2/x`` while layer 2 trains."""
@@ -245,11 +292,9 @@ class EnergyPretraining(StageModule):
         with torch.no_grad():
             v, (positive, inferred) = self.phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
-        processes = _OfTrainer(self.trainer, self.device) if self.trainer.world_size > 1 else Processes()
-        step = EnergyStep(
-            sampler=self.sampler, centring=self.centring, penalties=self.penalties, processes=processes
-        )
-        generator = self.streams["negative_phase"]
+        step, generator = self._step(), self.streams["negative_phase"]
+        if self._state.sampler is None and self.earlier is not None:
+            self._go_on(step, positive.v.shape[-2])
         gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
         loss = step.loss(self.model, gap, batch.share)
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
@@ -257,7 +302,7 @@ class EnergyPretraining(StageModule):
         self._gap = gap_so_far
         if batch.closes_step:
             self.model.project()
-            self.energy_gaps[self.layer] = processes.mean(gap_so_far)
+            self.energy_gaps[self.layer] = step.processes.mean(gap_so_far)
             self._state, self._gap = self._state.after_update(), 0.0
         return {
             "loss": loss.detach(),
@@ -284,6 +329,8 @@ class EnergyPretraining(StageModule):
             "offsets": offsets,
             "energy_gaps": list(self.energy_gaps),
             "begun_at": list(self._begun_at),
+            "left": dict(self._left),
+            "chains": dict(self.chains),
         }
         return cast(dict[str, Any], move_data_to_device(state, "cpu"))
 
@@ -301,6 +348,7 @@ class EnergyPretraining(StageModule):
     def take_extra_state(self, state: dict[str, Any]) -> None:
         """Take back the sampler's chains, the offsets and the energy gaps."""
         self._take_begun_at(state)
+        self._left, self.chains = dict(state.get("left", {})), dict(state.get("chains", {}))
         self.energy_gaps = [gap.to(self.device) for gap in state["energy_gaps"]]
         if state.get("offsets") is not None:
             offsets = Offsets(**{name: offset.to(self.device) for name, offset in state["offsets"].items()})

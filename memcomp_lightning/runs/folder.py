@@ -49,6 +49,20 @@ class RunFolder:
         """The weight file that a stage leaves."""
         return self.path / "weights" / f"{stage}.pt"
 
+    @property
+    def chains(self) -> Path:
+        """What pretraining leaves beside its weights, for a run that goes on from it."""
+        return self.path / "weights" / "pretrain_chains.pt"
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """The runs that this one goes on from, the oldest first."""
+        return list((self._read("history.json") or {}).get("runs", []))
+
+    def keep_history(self, runs: Sequence[Mapping[str, object]]) -> None:
+        """Write which runs this one goes on from, as :attr:`history` reads them."""
+        write_json(self.path / "history.json", {"runs": list(runs)})
+
     def checkpoint(self, stage: str) -> Path:
         """The checkpoint that a stage goes on from."""
         return self.path / "checkpoints" / stage / "last.ckpt"

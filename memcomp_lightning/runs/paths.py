@@ -3,7 +3,8 @@
 import re
 
 _NAMES = re.compile(
-    r"(.*\.)?(\w+_)?(problem|weights|path|file|filename|dir|dirpath|folder|root)|data\.(source\.)?(validation|test)"
+    r"(.*\.)?(\w+_)?(problem|continue|weights|path|file|filename|dir|dirpath|folder|root)"
+    r"|data\.(source\.)?(validation|test)"
 )
 
 

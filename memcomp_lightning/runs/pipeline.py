@@ -17,10 +17,11 @@ from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.callbacks.hyper_parameters import write_hyper_parameters
 from memcomp_lightning.data.baselines import independent_log_likelihood, logistic_regression, n_fitted
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.modules import Classifier, NotTrainedError, load_weights, save_weights
+from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedError, load_weights, save_weights
 from memcomp_lightning.modules.trainers import tries
-from memcomp_lightning.modules.weights import check_checkpoint
+from memcomp_lightning.modules.weights import check_checkpoint, write_tensors
 from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.history import passes_of, short, total_passes
 from memcomp_lightning.runs.table import final_log_likelihoods
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
@@ -64,11 +65,15 @@ def run(
             keeps = trainer.is_global_zero and not tries(trainer)
             records[name] = _record(stage)
             if keeps:
+                _keep_chains(stage, folder)
                 save_weights(stage.module.network, folder.weights(name))
                 folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
             plan.change_between_stages(seed)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
+    if folder.history:
+        result["history"] = short(folder.history)
+        result["total_passes"] = total_passes(folder.history, passes_of(records))
     if choice is not None:
         result["choice"] = choice
     if plan.finetuning is not None:
@@ -135,6 +140,13 @@ def _check_trained(stage: Stage) -> None:
             f"{module.n_models} models were trained: its weights are not recorded. "
             "Leave out the callback that ended it."
         )
+
+
+def _keep_chains(stage: Stage, folder: RunFolder) -> None:
+    """Write what a run that goes on from this one needs beside the weights."""
+    left = stage.module.left() if isinstance(stage.module, EnergyPretraining) else None
+    if left is not None:
+        write_tensors(left, folder.chains)
 
 
 def _record(stage: Stage) -> dict[str, Any]:

@@ -88,7 +88,19 @@ def run_table(result: dict[str, Any]) -> str:
     chosen = f"\nChosen on held-out training images: {choice['setting']} = {choice['value']:g}" if choice else ""
     judged = result.get("validation_accuracy")
     held_out = f"\nAccuracy on held-out training images: {with_error(judged)}" if judged else ""
-    return for_screen(rows) + chosen + held_out
+    return for_screen(rows) + chosen + held_out + _with_earlier_runs(result)
+
+
+def _with_earlier_runs(result: dict[str, Any]) -> str:
+    """A line on the passes of all runs of which each went on from the one before; nothing of the first."""
+    if not result.get("history"):
+        return ""
+    passes = [
+        f"{stage} {model} {n:,}" if model != "network" else f"{stage} {n:,}"
+        for stage, models in result["total_passes"].items()
+        for model, n in models.items()
+    ]
+    return f"\nGoes on from {result['history'][-1]['run']}. Passes in all: {', '.join(passes)}"
 
 
 def closing_lines(folder: Path) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from memcomp_lightning.configuration.plans import Shape, classifier_of, network_of, units_of_settings
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
-from memcomp_lightning.errors import UserError, require, require_count
+from memcomp_lightning.errors import UserError, require, require_choice, require_count
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules.weights import check_fits, read_checkpoint
@@ -145,6 +145,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
     files = (
         {name: folder.weights(name) for name in ("pretrain", "finetune")} if file is None else {file.stem: file}
     )
+    require_choice("weight file", next(iter(files)), ("pretrain", "finetune"))
     there = {name: where for name, where in files.items() if where.is_file()}
     if not there:
         raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}")

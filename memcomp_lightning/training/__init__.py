@@ -4,6 +4,7 @@ from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import JUDGED_BY, BestPass
 from memcomp_lightning.training.diverged import DivergedError, diverged_parameter, require_finite
 from memcomp_lightning.training.dropout import Dropout
+from memcomp_lightning.training.kept import kept_of, state_of
 from memcomp_lightning.training.loops import Batches, ClassifierTraining, Pass, PhaseTraining, finetune, pretrain
 from memcomp_lightning.training.losses import LOSSES, ClassWeighted, Loss, balanced, cross_entropy, squared_error
 from memcomp_lightning.training.penalties import L1, L2, GroupSparsity, Penalty
@@ -57,8 +58,10 @@ __all__ = [
     "diverged_parameter",
     "evaluate",
     "finetune",
+    "kept_of",
     "pretrain",
     "require_finite",
     "score",
     "squared_error",
+    "state_of",
 ]

@@ -20,12 +20,14 @@ from omegaconf import DictConfig
 from memcomp_lightning.cli import sweep
 from memcomp_lightning.cli.arguments import CommandLine, expanded, from_folder, read, unquoted, with_path
 from memcomp_lightning.cli.commands import report
+from memcomp_lightning.cli.continued import with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.configuration import comparisons, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
 from memcomp_lightning.configuration.composition import CONFIG_MODULE
+from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
 from memcomp_lightning.configuration.plans import build, check_without_trainer
@@ -34,6 +36,7 @@ from memcomp_lightning.errors import SettingError, UserError, require, require_c
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.history import history_with
 from memcomp_lightning.runs.table import closing_lines, run_table, short_path
 from memcomp_lightning.training import DivergedError
 
@@ -72,6 +75,8 @@ def train(config: DictConfig) -> float | None:
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
     if config.figure is not None or config.worth is not None:
+        allowed = "null: figures and comparisons train new networks"
+        require(config["continue"] is None, "continue", config["continue"], allowed)
         for study, part, own in _studies(config, overrides).values():
             study.check(part, own)
         return
@@ -117,6 +122,9 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
             pairs = [override.partition("=") for override in overrides if not override.startswith("hydra.")]
             by_name = {name: value for name, _, value in pairs}
             plan = build(config)
+            earlier = earlier_of(config)
+            if _is_first_process() and earlier is not None:
+                folder.keep_history(history_with(earlier.folder, earlier.weights))
             if _is_first_process() and plan.described:
                 say(f"{plan.described}\n")
             result = pipeline.run(
@@ -221,7 +229,7 @@ def main() -> None:
 
 
 def _read(arguments: list[str]) -> CommandLine:
-    line = read(_resumed(arguments))
+    line = read(with_settings_of_run(_resumed(arguments)))
     devices = line.value("trainer.devices")
     if line.multirun and devices not in (None, "1"):
         raise UserError(

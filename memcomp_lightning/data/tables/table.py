@@ -86,6 +86,7 @@ class Table:
         split_seed: Seed of that split.
         key: Which array of an ``.npz`` or HDF5 file.
         picture: Height and width, where the columns are the pixels of a picture.
+        schema: What the columns are, of an earlier training on such rows; None finds it out.
     """
 
     path: str | None = None
@@ -96,6 +97,7 @@ class Table:
     split_seed: int = 0
     key: str | None = None
     picture: tuple[int, int] | None = None
+    schema: TableSchema | None = None
 
     def __post_init__(self) -> None:
         if self.path is None:
@@ -123,6 +125,7 @@ class Table:
             test_fraction=self.test_fraction,
             split_seed=self.split_seed,
             picture=self.picture,
+            schema=self.schema,
         )
 
 
@@ -135,6 +138,7 @@ def table_data(
     test_fraction: float = 0.1,
     split_seed: int = 0,
     picture: tuple[int, int] | None = None,
+    schema: TableSchema | None = None,
 ) -> TableData:
     """Find the columns of a table in one pass over its rows, and make numbers of them in a second one.
 
@@ -146,11 +150,15 @@ def table_data(
         test_fraction: Share of the rows that is split off.
         split_seed: Seed of that split.
         picture: Height and width, where the columns are pixels.
+        schema: What the columns are; None finds it out.
     """
     further, given = further or {}, {"all": columns} if isinstance(columns, str) else dict(columns or {})
     summaries, n, named = _summaries(begin(), name, {column for column, kind in given.items() if kind == "ignore"})
-    found = find(summaries, given, name, uniform=not named)
-    schema = TableSchema(tuple(found.columns), found.label, found.weight, named)
+    if schema is None:
+        found = find(summaries, given, name, uniform=not named)
+        schema, ignored = TableSchema(tuple(found.columns), found.label, found.weight, named), found.ignored
+    else:
+        ignored = _besides(schema, [summary.name for summary in summaries])
     apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
     layout = None if picture is None else _layout(picture, schema)
     if "test" in apart:
@@ -163,7 +171,7 @@ def table_data(
         generator = rng.stream(split_seed, "test rows")
         order = torch.randperm(n, generator=generator, device="cpu").numpy()
         train, test = _split(begin(), name, schema, [n - n_test, n_test], order)
-    return TableData(train, test, apart.get("validation"), schema, name, layout, found.ignored)
+    return TableData(train, test, apart.get("validation"), schema, name, layout, ignored)
 
 
 def data_of(table: Any, label: Any = None, *, name: str = "table", **settings: Any) -> TableData:
@@ -190,6 +198,13 @@ LABEL = "label"
 def read_rows(path: Path, schema: TableSchema, *, complete: bool = True, key: str | None = None) -> Rows:
     """Rows of a file as numbers of the units of a schema; columns may be missing unless ``complete``."""
     return _whole(opened(path, key=key), str(path), schema, complete=complete)
+
+
+def _besides(schema: TableSchema, names: list[str]) -> dict[str, str]:
+    """Why each of the other columns of a table is left out."""
+    label = None if schema.label is None else schema.label.name
+    own = {*schema.site_names, label, schema.weight}
+    return {name: "the model does not have it" for name in names if name not in own}
 
 
 def _named(columns: Mapping[str, str] | str | None) -> dict[str, str]:
