@@ -37,6 +37,7 @@ from memcomp_lightning.samplers import ModeAssisted
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule, balanced
 from memcomp_lightning.training.schedules import check_schedules
+from memcomp_lightning.training.score import FILL_IN, NO_GAPS
 
 if TYPE_CHECKING:
     from memcomp_lightning.data import SequenceData, TableData
@@ -125,6 +126,8 @@ def build(config: DictConfig) -> Plan:
         remedy = "For a deep one that is fine-tuned use model=dbn pretrain=joint."
         require(layered, "finetune.iterations", config.finetune.iterations, allowed, remedy)
         rows = _data(config, "finetune", data, units)
+        draws = pretraining is not None and isinstance(network, DBN)
+        require(draws or not rows.has_gaps, "missing values", "in the data of a classifier", NO_GAPS, FILL_IN)
         callbacks = [*_callbacks(config, "finetune"), *_judges(config, rows)]
         classifier = classifier_of(config, network, data.n_classes, class_weights=_class_weights(config, rows))
         if earlier is not None and earlier.weights == "finetune":
@@ -203,6 +206,9 @@ def check_without_trainer(plan: Plan, config: DictConfig) -> None:
             check_bare_loop(callback, f"callbacks.{stage.module.stage}")
     allowed = "null: figures, comparisons and choices train new networks"
     require(config.get("continue") is None, "continue", config.get("continue"), allowed)
+    gaps = plan.finetuning is not None and plan.finetuning.data.has_gaps
+    allowed = "none where figures, comparisons and choices train classifiers"
+    require(not gaps, "missing values", "in the data of a classifier", allowed, FILL_IN)
     max_time = config.trainer.get("max_time")
     allowed = "null: figures, comparisons and choices train without a trainer"
     require(max_time is None, "trainer.max_time", max_time, allowed)

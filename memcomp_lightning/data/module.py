@@ -166,6 +166,12 @@ class RowsDataModule(LightningDataModule):
         return self.heldout if self.holds_out else None
 
     @property
+    def has_gaps(self) -> bool:
+        """Whether values of any rows are missing."""
+        parts = (self._train, self._heldout, self._test)
+        return any(part.observed is not None and not bool(part.observed.all()) for part in parts)
+
+    @property
     def holds_out(self) -> bool:
         """Whether there are rows to judge by beside the test rows."""
         return self._heldout is not self._test

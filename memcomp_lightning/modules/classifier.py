@@ -18,11 +18,11 @@ from memcomp_lightning.training import (
     Loss,
     OptimizerFactory,
     Schedule,
-    score,
 )
 from memcomp_lightning.training.dropout import require_share
+from memcomp_lightning.training.filling import Filling
 from memcomp_lightning.training.given import Given, as_batch
-from memcomp_lightning.training.score import require_complete, score_of
+from memcomp_lightning.training.score import judged, score_of
 
 
 class Classifier(StageModule):
@@ -59,10 +59,16 @@ class Classifier(StageModule):
         super().__init__(iterations=iterations, optimizer=optimizer, schedules=schedules, seed=seed)
         self.network = network
         self.dropout = dropout
+        self.filling: Filling | None = None
         if dropout:
             self.stream_names = (*self.stream_names, "dropout")
         plain_loss = LOSSES[loss]
         self.loss: Loss = plain_loss if class_weights is None else ClassWeighted(plain_loss, class_weights)
+
+    def fill_by(self, filling: Filling) -> None:
+        """Draw what is missing of the inputs, before training begins."""
+        self.filling = filling
+        self.stream_names = (*self.stream_names, "missing")
 
     def forward(self, v: Tensor) -> Tensor:
         """Class logits."""
@@ -79,6 +85,8 @@ class Classifier(StageModule):
         network = self.network if type(self).forward is Classifier.forward else self
         batch = as_batch(batch)
         batch = batch._replace(v=plain(batch.v), label=plain(batch.label))
+        if self.filling is not None:
+            batch = self.filling.complete(batch, self.streams["missing"])
         dropout = Dropout(self.dropout, [self.streams["dropout"]]) if self.dropout else None
         loss, losses, logits = ClassifierStep(network, self.loss, dropout).loss(batch)
         self.update(loss, closes_step=batch.closes_step)
@@ -86,9 +94,7 @@ class Classifier(StageModule):
 
     def validation_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of held-out images."""
-        batch = as_batch(batch)
-        require_complete(batch)
-        return {"score": score(self(batch.v), batch.label, self.loss)}
+        return {"score": judged(self, as_batch(batch), self.loss, self.filling, batch_idx)}
 
     def test_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Return the ``score`` of test images."""

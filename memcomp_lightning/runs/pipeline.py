@@ -25,6 +25,7 @@ from memcomp_lightning.runs.history import passes_of, short, total_passes
 from memcomp_lightning.runs.table import final_log_likelihoods
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
+from memcomp_lightning.training.filling import N_DRAWS
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +55,12 @@ def run(
     keeps, schema = True, plan.stages[0].data.schema
     if schema is not None and int(getattr(rank_zero_only, "rank", 0)) == 0:
         folder.keep_schema(schema.as_json())
+    if plan.finetuning is not None and plan.finetuning.data.has_gaps:
+        log.info(
+            "Where inputs of the classifier are missing, the pretrained model draws them, anew in each pass; "
+            "held-out and test rows are judged by the mean of the class probabilities over %d draws.",
+            N_DRAWS,
+        )
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():
@@ -69,6 +76,7 @@ def run(
                 save_weights(stage.module.network, folder.weights(name))
                 folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
+            plan.fill_gaps(seed)
             plan.change_between_stages(seed)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
     if folder.history:
@@ -81,11 +89,11 @@ def run(
             result["labels"] = plan.finetuning.data.n_labels
         module, data = plan.finetuning.module, plan.finetuning.data
         assert isinstance(module, Classifier)
-        score = evaluate(module.network, data.test_dataloader(), module.loss)
+        score = evaluate(module.network, data.test_dataloader(), module.loss, filling=module.filling)
         result["test_accuracy"] = score.accuracy.flatten().tolist()
         result["test_loss"] = score.mean_loss.flatten().tolist()
         if data.validation is not None:
-            held_out = evaluate(module.network, data.val_dataloader(), module.loss)
+            held_out = evaluate(module.network, data.val_dataloader(), module.loss, filling=module.filling)
             result["validation_accuracy"] = held_out.accuracy.flatten().tolist()
     if keeps:
         result["context"] = _context(plan, result)
@@ -167,7 +175,7 @@ def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
         heldout = heldout if heldout.ndim == 2 else heldout[0]
         masks = {name: mask[0] if mask is not None and mask.ndim == 3 else mask for name, mask in masks.items()}
     context: dict[str, Any] = {}
-    if "test_accuracy" in result:
+    if plan.finetuning is not None and not plan.finetuning.data.has_gaps:
         context["logistic_regression"] = _of_regression(plan)
     if any("log_likelihood" in record for record in result["stages"].values()):
         context["independent_units"] = {"heldout": independent_log_likelihood(train, heldout, data.units, **masks)}

@@ -15,6 +15,7 @@ from memcomp_lightning.models import DBN, Randomiser
 from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule
 from memcomp_lightning.studies.records import Named
 from memcomp_lightning.training import Batches, Pass, PretrainingStage, finetune, pretrain
+from memcomp_lightning.training.filling import Filling
 from memcomp_lightning.types import Batch
 
 
@@ -111,6 +112,13 @@ class Plan:
     finetuning: Stage | None
     between: Randomiser | None = None
     stage_for: Callable[[Any], PretrainingStage] | None = None
+
+    def fill_gaps(self, seed: int) -> None:
+        """Let the pretrained model, as it is now, draw what is missing of the inputs of fine-tuning."""
+        if self.finetuning is None or self.stage_for is None or not self.finetuning.data.has_gaps:
+            return
+        _, module = finetuning_of(self)
+        module.fill_by(Filling(self.stage_for(self.network).phases[0].model, seed=seed))
 
     def change_between_stages(self, seed: int) -> None:
         """Apply ``between`` to a pretrained DBN before it is fine-tuned; the same seed does the same."""

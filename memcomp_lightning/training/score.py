@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.training.filling import Filling
 from memcomp_lightning.training.losses import Loss, cross_entropy
 from memcomp_lightning.types import Batch
 
@@ -52,20 +53,43 @@ def score_of(losses: Tensor, logits: Tensor, label: Tensor) -> Score:
 
 
 @torch.no_grad()
-def evaluate(network: nn.Module, batches: Iterable[Batch], loss: Loss = cross_entropy) -> Score:
-    """Return the score of a network in evaluation mode over an iterable of :class:`Batch`."""
+def evaluate(
+    network: nn.Module, batches: Iterable[Batch], loss: Loss = cross_entropy, *, filling: Filling | None = None
+) -> Score:
+    """Return the score of a network in evaluation mode over an iterable of :class:`Batch`.
+
+    Args:
+        network: Maps inputs to logits.
+        batches: What it is judged by.
+        loss: Of each image.
+        filling: Draws what is missing; None refuses missing values.
+    """
     was_training = network.training
     network.eval()
     like = next(network.parameters())
     scores = []
-    for batch in batches:
-        require_complete(batch)
-        scores.append(score(network(batch.v.to(like)), batch.label.to(like.device), loss))
+    for number, batch in enumerate(batches):
+        observed = None if batch.observed is None else batch.observed.to(like.device)
+        there = batch._replace(v=batch.v.to(like), label=batch.label.to(like.device), observed=observed)
+        scores.append(judged(network, there, loss, filling, number))
     network.train(was_training)
     return sum(scores[1:], start=scores[0])
 
 
+def judged(network: nn.Module, batch: Batch, loss: Loss, filling: Filling | None, number: int) -> Score:
+    """The score of a batch by its number; with ``filling`` it may have missing values."""
+    if filling is not None:
+        return score(filling.judged(network, batch, number, loss), batch.label, loss)
+    require_complete(batch)
+    return score(network(batch.v), batch.label, loss)
+
+
 def require_complete(batch: Batch) -> None:
     """Raise a SettingError where values are missing, for which a classifier has no input."""
-    remedy = "Pretrain alone (finetune.iterations=0), or fill them in first."
-    require(batch.observed is None, "missing values", "in the data of a classifier", "none", remedy)
+    require(batch.observed is None, "missing values", "in the data of a classifier", NO_GAPS, FILL_IN)
+
+
+NO_GAPS = "none, but for a DBN that was pretrained on these data in the same run and draws them"
+FILL_IN = (
+    "Fill them in first, by memcomp-impute with a model of the data, or pretrain alone: finetune.iterations=0."
+)
