@@ -301,7 +301,7 @@ class TableDataModule(RowsDataModule):
         settings: Of :class:`RowsDataModule`: ``batch_size``, ``partitions``, ``validation_fraction`` and so on.
     """
 
-    most_numbers: ClassVar[int | None] = 2**22
+    most_numbers: ClassVar[int | None] = 2**24
 
     def __init__(self, table: "TableData | SequenceData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
