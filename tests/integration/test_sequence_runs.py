@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import RunCommand
 from running import QUIET, Outcome
 
 import memcomp_lightning
@@ -34,7 +33,7 @@ def family(memcomp_train: Train) -> Path:
     return path
 
 
-def test_commands_of_the_page(memcomp_train: Train, run_command: RunCommand, family: Path) -> None:
+def test_commands_of_the_page(memcomp_train: Train, run_command: Callable[..., Outcome], family: Path) -> None:
     assert len(COMMANDS) == 2
     outcomes = [memcomp_train(*arguments, *QUIET) for _, *arguments in COMMANDS]
     assert [outcome.status for outcome in outcomes] == [0, 0], [outcome.err for outcome in outcomes]

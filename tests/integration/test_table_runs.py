@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import RunCommand
 from running import QUIET, Outcome
 
 import memcomp_lightning
@@ -29,7 +28,7 @@ Command = Callable[..., Outcome]
 
 
 @pytest.fixture
-def command(run_command: RunCommand, monkeypatch: pytest.MonkeyPatch) -> Command:
+def command(run_command: Callable[..., Outcome], monkeypatch: pytest.MonkeyPatch) -> Command:
     """Run a command in this process, in a folder."""
 
     def run(name: str, *arguments: str, folder: Path) -> Outcome:
