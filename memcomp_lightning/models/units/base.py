@@ -154,6 +154,10 @@ class Units(nn.Module):
         """
         return kept
 
+    def decode(self, v: Values) -> Tensor:
+        """Data as they are kept, one column a site, of entries: the same, but for categories."""
+        return v
+
     def values_of(self, mean: Values, *, generator: Generator) -> Values:
         """Draw values of data that may be means in between, as grey values are; real ones stay."""
         drawn = self.sample_of_mean(mean, generator=generator)

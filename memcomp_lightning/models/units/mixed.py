@@ -139,6 +139,10 @@ class Mixed(Units):
         found = [kind.encode(part, check=check) for kind, part in zip(self.kinds, parts, strict=True)]
         return torch.cat(found, dim=-1)
 
+    def decode(self, v: Values) -> Tensor:
+        """Of each part, in the dtype of v."""
+        return self._each(lambda kind, part: kind.decode(part).to(v.dtype), v)
+
     def values_of(self, mean: Values, *, generator: Generator) -> Values:
         """Of each part."""
         return self._each(lambda kind, part: kind.values_of(part, generator=generator), mean)
