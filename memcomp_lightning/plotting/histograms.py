@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.plotting.style import DATA, FOURTH, HELDOUT, SAMPLES
 
-# Okabe and Ito's colours, which colour-blind readers tell apart; they differ in lightness, too.
-_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7")
+COLOURS = (DATA, SAMPLES, HELDOUT, FOURTH)
 
 
 def plot_histograms(
@@ -23,11 +23,11 @@ def plot_histograms(
             as shares of its sum.
         xlabel: Name of the quantity.
     """
-    allowed = f"1 to {len(_COLOURS)} sets of counts"
-    require(1 <= len(counts) <= len(_COLOURS), "counts", sorted(counts), allowed)
+    allowed = f"1 to {len(COLOURS)} sets of counts"
+    require(1 <= len(counts) <= len(COLOURS), "counts", sorted(counts), allowed)
     figure = Figure(figsize=(4.2, 2.6), layout="constrained")
     axes = figure.add_subplot()
-    for colour, (name, values) in zip(_COLOURS, counts.items(), strict=False):
+    for colour, (name, values) in zip(COLOURS, counts.items(), strict=False):
         axes.stairs(values / values.sum(), edges, fill=True, color=colour, alpha=0.35)
         axes.stairs(values / values.sum(), edges, color=colour, linewidth=1.1, label=name)
     axes.set(xlabel=xlabel, ylabel="share")
