@@ -6,6 +6,7 @@ from memcomp_lightning.callbacks.classification import ClassificationMetrics
 from memcomp_lightning.callbacks.densities import Densities
 from memcomp_lightning.callbacks.energy_histograms import EnergyHistograms
 from memcomp_lightning.callbacks.free_energy_gap import FreeEnergyGap
+from memcomp_lightning.callbacks.free_energy_histograms import FreeEnergyHistograms
 from memcomp_lightning.callbacks.gradient_bias import GradientBias
 from memcomp_lightning.callbacks.histograms import ParameterHistograms
 from memcomp_lightning.callbacks.hyper_parameters import HyperParameters
@@ -18,6 +19,7 @@ from memcomp_lightning.callbacks.progress import StageProgressBar
 from memcomp_lightning.callbacks.receptive_fields import ReceptiveFields
 from memcomp_lightning.callbacks.reconstruction_error import ReconstructionError
 from memcomp_lightning.callbacks.sampler_diagnostics import SamplerDiagnostics
+from memcomp_lightning.callbacks.samples_against_data import SamplesAgainstData
 from memcomp_lightning.callbacks.saturation_guard import SaturationGuard
 from memcomp_lightning.callbacks.schedules import Schedules
 from memcomp_lightning.callbacks.stage_times import StageTimes
@@ -32,6 +34,7 @@ __all__ = [
     "Densities",
     "EnergyHistograms",
     "FreeEnergyGap",
+    "FreeEnergyHistograms",
     "GradientBias",
     "HyperParameters",
     "LogLikelihood",
@@ -43,6 +46,7 @@ __all__ = [
     "ReceptiveFields",
     "ReconstructionError",
     "SamplerDiagnostics",
+    "SamplesAgainstData",
     "SaturationGuard",
     "Schedules",
     "StageProgressBar",

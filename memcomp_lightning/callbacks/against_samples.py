@@ -1,6 +1,8 @@
 """What the callbacks share that hold samples of the model against the data."""
 
+import copy
 from abc import abstractmethod
+from typing import NamedTuple
 
 import lightning.pytorch as pl
 import torch
@@ -11,14 +13,17 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import (
     EveryIterations,
     LastImages,
+    ShownModel,
     images_of_step,
     mask_of_step,
     model_of,
     tensorboards,
+    weight_of_step,
     write_picture,
 )
 from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.data.sequences import SequenceSchema
+from memcomp_lightning.data.shown import Shown
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.models.units import Categorical, Mixed, Units
@@ -35,13 +40,28 @@ def fresh_chains(model: EnergyModel, n: int, n_sweeps: int, seed: int) -> Tensor
     return x
 
 
+class Seen(NamedTuple):
+    """What a picture is drawn of; the rows are those of the first replica, on the CPU.
+
+    Attributes:
+        model: In training.
+        data: Training images.
+        samples: Of the model.
+        heldout: Images of the validation; None without one.
+    """
+
+    model: ShownModel
+    data: Shown
+    samples: Shown
+    heldout: Shown | None
+
+
 class AgainstSamples(EveryIterations):
-    """A figure of data and samples of the first replica, in TensorBoard; none where the units are of other kinds.
+    """Figures of data and samples of the first replica, in TensorBoard; none where the units are of other kinds.
 
     Data are the images of the pass's last batches, samples are visible states of Gibbs chains that start afresh.
 
     Args:
-        tag: Name of the picture, after stage and layer.
         every: Passes between two pictures, >= 1.
         n_images: Images to take, >= 1; whole batches are taken.
         n_samples: Chains, >= 1.
@@ -49,28 +69,22 @@ class AgainstSamples(EveryIterations):
         seed: Seed of the chains.
     """
 
-    def __init__(self, tag: str, every: int, n_images: int, n_samples: int, n_sweeps: int, seed: int) -> None:
+    def __init__(self, every: int, n_images: int, n_samples: int, n_sweeps: int, seed: int) -> None:
         super().__init__(every)
         require_count("n_samples", n_samples)
         require_count("n_sweeps", n_sweeps)
-        self.tag = tag
         self.n_samples = n_samples
         self.n_sweeps = n_sweeps
         self.seed = seed
-        self._train = LastImages(n_images)
+        self._train, self._heldout = LastImages(n_images), LastImages(n_images)
 
-    @abstractmethod
     def has_units(self, units: Units) -> bool:
-        """Whether there is anything to draw of these visible units."""
+        """Whether there is anything to draw of these visible units: of all, unless a subclass says otherwise."""
+        return True
 
     @abstractmethod
-    def figure(
-        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
-    ) -> Figure:
-        """Draw data ``(n, n_visible)``, their mask, and samples ``(n_samples, n_visible)``.
-
-        ``schema`` says what the units stand for; None where that is not known.
-        """
+    def figures(self, seen: Seen) -> dict[str, Figure]:
+        """Draw data and samples: figures by their tags."""
 
     def on_train_epoch_start(self, *_: object) -> None:
         """Forget the last pass."""
@@ -81,19 +95,42 @@ class AgainstSamples(EveryIterations):
     ) -> None:
         """Keep the visible states of the last batches."""
         super().on_train_batch_end(trainer, pl_module, outputs)
-        if self.is_due(trainer, pl_module) and self.has_units(model_of(pl_module).visible):
-            self._train.add(images_of_step(outputs, self), mask_of_step(outputs))
+        if self._looks(trainer, pl_module):
+            self._train.add(images_of_step(outputs, self), mask_of_step(outputs), weight_of_step(outputs))
+
+    def on_validation_epoch_start(self, *_: object) -> None:
+        """Forget the last validation."""
+        self._heldout = LastImages(self._heldout.n)
+
+    def on_validation_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object, *_: object
+    ) -> None:
+        """Keep the visible states of the last held-out images, the same in each pass."""
+        if isinstance(outputs, dict) and "v" in outputs and self._looks(trainer, pl_module):
+            self._heldout.add(outputs["v"], mask_of_step(outputs), weight_of_step(outputs))
 
     def look(self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: object) -> None:
         """Run the chains, and draw."""
-        model, data, observed = model_of(pl_module), self._train.images(), self._train.observed()
-        if data is None or not tensorboards(trainer) or not self.has_units(model.visible):
+        model, schema = model_of(pl_module), schema_of_model(trainer, pl_module)
+        if not tensorboards(trainer) or not self.has_units(model.visible):
             return
-        samples = fresh_chains(model, self.n_samples, self.n_sweeps, self.seed)[..., : model.n_visible]
-        mask = None if observed is None else _first(observed)
-        schema = schema_of_model(trainer, pl_module)
-        figure = self.figure(model.visible, _first(data), mask, _first(samples), schema)
-        write_picture(trainer, pl_module, self.tag, rendered(figure))
+        units = copy.deepcopy(model.visible).cpu()
+        if schema is not None and schema.n_sites != units.n_sites:
+            schema = None  # somebody else's module sees something else of the data
+        data, heldout = (_shown(images, units, schema) for images in (self._train, self._heldout))
+        if data is None:
+            return
+        v = _first(fresh_chains(model, self.n_samples, self.n_sweeps, self.seed)[..., : model.n_visible])
+        if not bool(v.isfinite().all()):
+            self.leave_out("the chains ran away to infinity")
+            return
+        seen = Seen(model, data, Shown(units, v, schema=schema), heldout)
+        for tag, figure in self.figures(seen).items():
+            write_picture(trainer, pl_module, tag, rendered(figure))
+
+    def _looks(self, trainer: pl.Trainer, module: pl.LightningModule) -> bool:
+        """Whether the present pass ends with a picture."""
+        return self.is_due(trainer, module) and self.has_units(model_of(module).visible)
 
 
 def schema_of_model(trainer: pl.Trainer, module: pl.LightningModule) -> Schema | None:
@@ -133,12 +170,23 @@ def by_site(units: Units, x: Tensor) -> Tensor:
     return torch.stack(wide, dim=-2)
 
 
-def frequencies(units: Units, v: Tensor, observed: Tensor | None = None) -> Tensor:
+def frequencies(units: Units, v: Tensor, observed: Tensor | None = None, weight: Tensor | None = None) -> Tensor:
     """Shares of the states at each site of the categories, ``(n_sites, q)``, of the observed values."""
-    if observed is None:
-        return by_site(units, v.float().mean(-2))
-    known = torch.where(observed, v, 0.0).sum(-2) / observed.sum(-2).clamp(min=1)
-    return by_site(units, known)
+    w = torch.ones_like(v[:, :1]) if weight is None else weight.to(v.dtype).unsqueeze(-1)
+    known = torch.ones_like(v) if observed is None else observed.to(v.dtype)
+    total = (w * known).sum(-2)
+    smallest = torch.finfo(v.dtype).tiny
+    return by_site(units, (w * known * v).sum(-2) / total.clamp(min=smallest))
+
+
+def _shown(images: LastImages, units: Units, schema: Schema | None) -> Shown | None:
+    """The rows of the first replica; None without any."""
+    v, observed, weight = images.images(), images.observed(), images.weight()
+    if v is None:
+        return None
+    mask = None if observed is None else _first(observed)
+    counts = None if weight is None else weight.reshape(-1, weight.shape[-1])[0].detach().cpu()
+    return Shown(units, _first(v), mask, counts, schema)
 
 
 def _first(x: Tensor) -> Tensor:

@@ -50,6 +50,7 @@ class StepOutputs(TypedDict, total=False):
         v: Visible states of held-out images, of ``validation_step``; of ``training_step`` those of its images, if
             ``positive.v`` is something else.
         observed: Where ``v`` is known, a mask of its shape; None, or left out, is everywhere.
+        weight: How often each image of ``v`` counts, ``(n,)``; None, or left out, is once.
         score: Of a classifier; of all steps.
     """
 
@@ -59,6 +60,7 @@ class StepOutputs(TypedDict, total=False):
     info: dict[str, Tensor]
     v: Tensor
     observed: Tensor | None
+    weight: Tensor | None
     score: Score
 
 
@@ -154,24 +156,33 @@ class LastImages:
     def __init__(self, n: int) -> None:
         require_count("n_images", n)
         self.n = n
-        self._batches: list[tuple[Tensor, Tensor | None]] = []
+        self._batches: list[tuple[Tensor, Tensor | None, Tensor | None]] = []
 
-    def add(self, v: Tensor, observed: Tensor | None = None) -> None:
-        """Keep references to the images ``(*replicas, n, n_visible)`` of a batch, and to their mask."""
-        self._batches.append((v[..., : self.n, :], None if observed is None else observed[..., : self.n, :]))
-        while sum(kept.shape[-2] for kept, _ in self._batches[1:]) >= self.n:
+    def add(self, v: Tensor, observed: Tensor | None = None, weight: Tensor | None = None) -> None:
+        """Keep references to the images ``(*replicas, n, n_visible)`` of a batch, their mask and their weights."""
+        mask = None if observed is None else observed[..., : self.n, :]
+        counts = None if weight is None else weight[..., : self.n]
+        self._batches.append((v[..., : self.n, :], mask, counts))
+        while sum(kept.shape[-2] for kept, _, _ in self._batches[1:]) >= self.n:
             self._batches.pop(0)
 
     def images(self) -> Tensor | None:
         """The kept images, ``(*replicas, n, n_visible)``; None before the first batch."""
-        return torch.cat([v for v, _ in self._batches], dim=-2) if self._batches else None
+        return torch.cat([v for v, _, _ in self._batches], dim=-2) if self._batches else None
 
     def observed(self) -> Tensor | None:
         """Where they are known; None is everywhere."""
-        if all(mask is None for _, mask in self._batches):
+        if all(mask is None for _, mask, _ in self._batches):
             return None
-        masks = [torch.ones_like(v, dtype=torch.bool) if mask is None else mask for v, mask in self._batches]
+        masks = [torch.ones_like(v, dtype=torch.bool) if mask is None else mask for v, mask, _ in self._batches]
         return torch.cat(masks, dim=-2)
+
+    def weight(self) -> Tensor | None:
+        """How often they count, ``(*replicas, n)``; None is once each."""
+        if all(counts is None for _, _, counts in self._batches):
+            return None
+        weights = [v.new_ones(v.shape[:-1]) if counts is None else counts for v, _, counts in self._batches]
+        return torch.cat(weights, dim=-1)
 
 
 class EveryIterations(pl.Callback, ABC):
@@ -228,6 +239,11 @@ def images_of_step(outputs: object, callback: pl.Callback) -> Tensor:
 def mask_of_step(outputs: object) -> Tensor | None:
     """Where the images of a step are known; None is everywhere."""
     return cast(StepOutputs, outputs).get("observed") if isinstance(outputs, Mapping) else None
+
+
+def weight_of_step(outputs: object) -> Tensor | None:
+    """How often the images of a step count; None is once each."""
+    return cast(StepOutputs, outputs).get("weight") if isinstance(outputs, Mapping) else None
 
 
 def required(outputs: object, callback: pl.Callback, *keys: str) -> StepOutputs:

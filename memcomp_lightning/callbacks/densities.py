@@ -2,10 +2,8 @@
 
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
-from memcomp_lightning.callbacks.against_samples import AgainstSamples, kinds_in
-from memcomp_lightning.data.schema import Schema
+from memcomp_lightning.callbacks.against_samples import AgainstSamples, Seen, kinds_in
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.plotting.densities import plot_densities
@@ -34,7 +32,7 @@ class Densities(AgainstSamples):
         n_units: int = 6,
         seed: int = 0,
     ) -> None:
-        super().__init__("densities", every, n_images, n_samples, n_sweeps, seed)
+        super().__init__(every, n_images, n_samples, n_sweeps, seed)
         require_count("n_units", n_units)
         self.n_units = n_units
 
@@ -42,14 +40,13 @@ class Densities(AgainstSamples):
         """Whether some are real."""
         return units.real
 
-    def figure(
-        self, units: Units, data: Tensor, observed: Tensor | None, samples: Tensor, schema: Schema | None
-    ) -> Figure:
+    def figures(self, seen: Seen) -> dict[str, Figure]:
         """The histograms."""
-        real = torch.cat([torch.arange(at.start, at.stop) for kind, at in kinds_in(units) if kind.real])
-        seen = data if observed is None else torch.where(observed, data, torch.nan)
-        seen = seen[:, real]
-        variance = (seen - seen.nanmean(0)).square().nanmean(0).nan_to_num(nan=0.0)
+        data, samples = seen.data, seen.samples
+        real = torch.cat([torch.arange(at.start, at.stop) for kind, at in kinds_in(data.units) if kind.real])
+        known = torch.from_numpy(data.entries)[:, real]
+        variance = (known - known.nanmean(0)).square().nanmean(0).nan_to_num(nan=0.0)
         chosen = torch.topk(variance, min(self.n_units, len(real))).indices.sort().values
-        names = [f"unit {unit}" for unit in real[chosen].tolist()]
-        return plot_densities(seen[:, chosen].numpy(), samples[:, real[chosen]].numpy(), names)
+        names = [data.entry_names[unit] for unit in real[chosen].tolist()]
+        drawn = samples.entries[:, real[chosen].numpy()]
+        return {"densities": plot_densities(known[:, chosen].numpy(), drawn, names)}

@@ -309,16 +309,17 @@ class EnergyPretraining(StageModule):
             "contrast": gap.detach(),
             "v": v,
             "observed": batch.observed if self.phase.complete is None else None,
+            "weight": batch.weight,
             "positive": positive,
             "negative": negative.configurations,
             "info": {**inferred, **negative.info},
         }
 
     def validation_step(self, batch: Given, batch_idx: int) -> dict[str, Tensor | None]:
-        """Return the model's visible states ``v`` of held-out images, and where they are known."""
+        """Return the model's visible states ``v`` of held-out images, where they are known, and their weights."""
         batch = as_batch(batch, self._units)
         v, observed = self.phase.seen_of(batch, rng.stream(self.seed, "validation", batch_idx))
-        return {"v": v, "observed": observed}
+        return {"v": v, "observed": observed, "weight": batch.weight}
 
     def extra_state(self) -> dict[str, Any]:
         """The sampler's chains, the offsets and the energy gaps."""

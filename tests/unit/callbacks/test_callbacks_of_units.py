@@ -9,9 +9,10 @@ import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
-from foreign import events_in, tensorboard
+from foreign import blank, events_in, tensorboard
 
 from memcomp_lightning import callbacks, rng
+from memcomp_lightning.callbacks import against_samples
 from memcomp_lightning.callbacks.against_samples import by_site, frequencies
 from memcomp_lightning.callbacks.sampler_diagnostics import _changed
 from memcomp_lightning.data import ImageDataModule, ShiftingBars
@@ -24,7 +25,8 @@ from memcomp_lightning.plotting.logo import letter_heights
 from memcomp_lightning.samplers import PCD
 from memcomp_lightning.training import DivergedError, Greedy
 
-PICTURES = {"receptive_fields", "samples", "chains", "energies"}
+OF_ALL = {"energies", "marginals", "correlations", "plane", "free_energies"}
+PICTURES = OF_ALL | {"receptive_fields", "samples", "chains"}
 OF_CATEGORIES = {"state_frequencies", "state_weights", "logos"}
 CASES: dict[str, tuple[Units, Units, set[str]]] = {
     "spins": (Spin(9), Spin(4), PICTURES | {"trajectory"}),
@@ -33,9 +35,14 @@ CASES: dict[str, tuple[Units, Units, set[str]]] = {
     "mixed": (
         Mixed(Bernoulli(3), Categorical([2, 2, 3]), Gaussian(3)),
         Spin(4),
-        {"energies", "densities"} | OF_CATEGORIES,
+        OF_ALL | {"densities"} | OF_CATEGORIES,
     ),
 }
+
+
+@pytest.fixture(autouse=True)
+def _no_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(against_samples, "rendered", blank)
 
 
 class Kept(Mixed):
@@ -62,6 +69,8 @@ def all_callbacks() -> list[pl.Callback]:
         callbacks.StateWeights(every=1),
         callbacks.Logos(every=1, n_samples=9, n_sweeps=3),
         callbacks.Densities(every=1, n_samples=9, n_sweeps=3),
+        callbacks.SamplesAgainstData(every=1, n_samples=9, n_sweeps=3, n_panels=2),
+        callbacks.FreeEnergyHistograms(every=1, n_samples=9, n_sweeps=3),
         callbacks.TrajectoryFigure(every=1),
         callbacks.SaturationGuard(),
     ]

@@ -6,7 +6,7 @@ from typing import Any
 import lightning.pytorch as pl
 import pytest
 import torch
-from foreign import IMAGES, PREFIX, TheirChains, TheirRBM, events_in, fit, tensorboard
+from foreign import IMAGES, PREFIX, TheirChains, TheirRBM, blank, events_in, fit, tensorboard
 from lightning.pytorch.loggers import CSVLogger
 
 from memcomp_lightning.callbacks import (
@@ -15,6 +15,7 @@ from memcomp_lightning.callbacks import (
     Densities,
     EnergyHistograms,
     FreeEnergyGap,
+    FreeEnergyHistograms,
     GradientBias,
     HyperParameters,
     Logos,
@@ -25,6 +26,7 @@ from memcomp_lightning.callbacks import (
     ReceptiveFields,
     ReconstructionError,
     SamplerDiagnostics,
+    SamplesAgainstData,
     SaturationGuard,
     Schedules,
     StageProgressBar,
@@ -32,9 +34,15 @@ from memcomp_lightning.callbacks import (
     StateFrequencies,
     StateWeights,
     TrajectoryFigure,
+    against_samples,
 )
 from memcomp_lightning.callbacks.base import model_of
 from memcomp_lightning.training import MomentumSchedule
+
+
+@pytest.fixture(autouse=True)
+def _no_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(against_samples, "rendered", blank)
 
 
 def all_callbacks() -> list[pl.Callback]:
@@ -55,6 +63,8 @@ def all_callbacks() -> list[pl.Callback]:
         StateWeights(every=1),
         Logos(every=1, n_samples=4, n_sweeps=3),
         Densities(every=1, n_samples=4, n_sweeps=3),
+        SamplesAgainstData(every=1, n_samples=4, n_sweeps=3, n_panels=2),
+        FreeEnergyHistograms(every=1, n_samples=4, n_sweeps=3),
         TrajectoryFigure(every=1),
         SaturationGuard(),
         ClassificationMetrics(),
@@ -98,7 +108,8 @@ def test_tensorboard_holds_everything(tmp_path: Path) -> None:
         "heldout_accuracy",
     }
     assert {f"{PREFIX}/{name}" for name in scalars} <= set(tags["scalars"])
-    pictures = {"receptive_fields", "samples", "chains", "energies", "trajectory"}
+    pictures = {"receptive_fields", "samples", "chains", "energies", "trajectory", "free_energies"}
+    pictures |= {"marginals", "correlations", "plane"}
     assert set(tags["images"]) == {f"{PREFIX}/{name}" for name in pictures}
     histograms = {"weight", "b", "c", "energies_data", "energies_model"}
     assert {f"{PREFIX}/{name}" for name in histograms} <= set(tags["histograms"])
