@@ -1,15 +1,13 @@
 """Values of units in the words of their data, as pictures show them."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import PixelLayout, TableSchema
 from memcomp_lightning.data.schema import ImageSchema
+from memcomp_lightning.data.sequences import SequenceSchema
 from memcomp_lightning.data.shown import Shown
 from memcomp_lightning.data.tables.columns import Binary, Category, Real, SpinColumn
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin
@@ -56,25 +54,11 @@ def test_units_of_which_nothing_is_known_keep_their_numbers() -> None:
     assert of_two_each.entry_names == ["unit 0", "unit 1", "unit 2", "unit 3"]
 
 
-class Sequences:
-    """What data of sequences offer: a text for each row, and units with a state for each letter."""
-
-    n_sites = 3
-    site_names = ("1", "2", "3")
-
-    def units(self) -> Categorical:
-        return Categorical(3, q=3)
-
-    def decode(self, v: Tensor) -> dict[str, Any]:
-        letters = np.array(list("AC-X"))[v.nan_to_num(nan=3).long().numpy()]
-        return {"sequence": np.array(["".join(row) for row in letters], dtype=object)}
-
-
 def test_sequences_have_a_column_for_each_site() -> None:
-    units = Categorical(3, q=3)
+    schema = SequenceSchema(3, "rna")
+    units = schema.units()
     observed = units.over_sites(torch.tensor([[True, True, False], [True, True, True]]))
-    schema: Any = Sequences()
-    shown = Shown(units, units.encode(torch.tensor([[0, 1, 0], [2, 2, 1]])), observed, schema=schema)
+    shown = Shown(units, units.encode(torch.tensor([[0, 1, 0], [4, 4, 1]])), observed, schema=schema)
     columns = {name: cells.tolist() for name, cells in shown.columns.items()}
     assert columns == {"site 1": ["A", "-"], "site 2": ["C", "-"], "site 3": [None, "C"]}
 

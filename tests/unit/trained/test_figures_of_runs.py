@@ -11,6 +11,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.data import TableSchema
 from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.sequences import SequenceSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, RBM
@@ -69,6 +70,26 @@ def test_a_run_is_shown_beside_data_and_held_out_data(monkeypatch: pytest.Monkey
 def test_a_stack_without_an_energy_has_no_free_energies() -> None:
     dbn = DBN(visible=SCHEMA.units(), hidden_sizes=[3, 2])
     assert set(figures_of(run_of(dbn), rows(20), rows(20).v)) == {"marginals", "correlations", "plane"}
+
+
+def test_sequences_have_logos_with_the_letters_of_the_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Any] = {}
+
+    def keep(tables: Any, *, alphabet: str) -> str:
+        drawn.update(tables, alphabet=alphabet)
+        return "logos"
+
+    monkeypatch.setattr(figures_module, "plot_logo", keep)
+    schema = SequenceSchema(4, "rna")
+    run = Run(Path("run"), RBM(visible=schema.units(), n_hidden=2), schema=schema)
+    v = torch.tensor([[0.0, 1, 2, 3], [0, 1, 2, 4]])
+    data = Rows(v, torch.full((2,), -1), weight=torch.tensor([3.0, 1.0]))
+    found = figures_of(run, data, v[:1])
+    assert set(found) == {"marginals", "correlations", "plane", "free_energies", "logos", "state_frequencies"}
+    assert drawn["alphabet"] == schema.letters
+    assert drawn["data"][3].tolist() == [0, 0, 0, 0.75, 0.25]
+    assert drawn["samples"][3].tolist() == [0, 0, 0, 1, 0]
+    assert {title.split(" (")[0] for title in titles(found["marginals"])} == {f"site {k}" for k in (1, 2, 3, 4)}
 
 
 def test_known_values_are_hidden_at_random() -> None:
