@@ -82,7 +82,7 @@ class Usage(Generic[T]):
             name = re.match(r"(\w+): ", line)
             if name and name[1] in defaults:
                 value = defaults[name[1]]
-                shown = {None: "null", True: "true", False: "false"}.get(value, value)  # type: ignore[arg-type]
+                shown = str(value).lower() if isinstance(value, bool) else "null" if value is None else value
                 lines.append(f"  {name[1]}={shown}\n      {line[name.end() :]}")
             else:
                 lines.append(f"      {line.strip()}")

@@ -24,6 +24,9 @@ from memcomp_lightning.models.observed import check_mask, log_weight_of_hidden
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import all_states
 
+_FEW = 16
+"""Bits of which samples are drawn from a list of all states."""
+
 
 @torch.no_grad()
 def log_partition_function(model: EnergyModel, *, max_units: int = 25, progress: bool = False) -> PerReplica:
@@ -69,7 +72,8 @@ def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 
     require_count("n", n)
     remedy = "Of a machine of two classes take as_two_layers(model).rbm, whose visible units are the first class."
     require(isinstance(model, RBM), "model", type(model).__name__, "an RBM", remedy)
-    binary = in_bits(model)
+    few = model.n_enumerated <= min(max_units, _FEW)  # a list of all states is faster than two halves of it
+    binary = None if few else in_bits(model)
     if binary is None:
         return _samples_by_cumulants(model, n, generator, min(max_units, 20))
     layers = enumerable(binary.rbm, max_units)

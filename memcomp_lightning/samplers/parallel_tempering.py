@@ -73,11 +73,16 @@ class ParallelTempering:
 
     def init(self, model: EnergyModel, n_chains: int, *, generator: Generator) -> Ladder:
         """Start all chains at random states and the gaps equal."""
-        n, n_temperatures, replicas = self.n_chains or n_chains, self.n_temperatures, model.replicas
-        x = model.chains().random(n_temperatures * n, generator=generator)
+        n = self.n_chains or n_chains
+        x = model.chains().random(self.n_temperatures * n, generator=generator)
+        return self.ladder(x.unflatten(-2, (self.n_temperatures, n)))
+
+    def ladder(self, x: Tensor) -> Ladder:
+        """Ladders of these states, ``(*replicas, n_temperatures, n_chains, n_units)``, with equal gaps."""
+        *replicas, n_temperatures, n, _ = x.shape
         gap = x.new_full((*replicas, n_temperatures - 1), 1.0 / (n_temperatures - 1))
         return Ladder(
-            x=x.unflatten(-2, (n_temperatures, n)),
+            x=x,
             gap=gap,
             swap_rate=torch.full_like(gap, self.target_swap_rate),
             last_end=torch.zeros((*replicas, n_temperatures, n), dtype=torch.float32, device=x.device),
@@ -92,7 +97,7 @@ class ParallelTempering:
         """Return the coldest configuration of each ladder."""
         chains = model.chains()
         for _ in range(self.k):
-            state = self._round(chains, state, generator)
+            state = self.advanced(chains, state, generator=generator)
         info = {
             "swap_rate": state.swap_rate.mean(-1),
             "swap_rate_lowest": state.swap_rate.amin(-1),
@@ -101,7 +106,7 @@ class ParallelTempering:
         }
         return NegativePhase(chains.read(state.x[..., 0, :, :].clone()), state, info)
 
-    def _round(self, chains: Chains, state: Ladder, generator: Generator) -> Ladder:
+    def advanced(self, chains: Chains, state: Ladder, *, generator: Generator) -> Ladder:
         """A sweep at every temperature, and exchanges of every second pair of neighbours."""
         shape, beta = state.x.shape, betas(state.gap)
         n_chains = shape[-2]

@@ -1,0 +1,76 @@
+"""Independent rows of models that are small enough to be enumerated."""
+
+import torch
+from torch import Generator, Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.likelihood import exact_samples
+from memcomp_lightning.models import RBM, EnergyModel
+from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field
+from memcomp_lightning.models.units import all_states
+from memcomp_lightning.trained.chains.target import Target
+
+MOST_BITS = 16
+"""Bits that are enumerated once for all rows."""
+
+MOST_HIDDEN_BITS = 10
+"""Bits of the hidden layer that are enumerated for each row of which something is known."""
+
+NUMBERS = 2**24
+"""Numbers of a table that are held at once."""
+
+
+def why_exact(target: Target) -> str | None:
+    """Why rows can be drawn exactly, and what it costs; None if they cannot, or at a price."""
+    model = target.model
+    if target.v is None:
+        n, most, what = model.n_enumerated, MOST_BITS, "of the smaller layer"
+        if not isinstance(model, RBM):
+            what = "outside the largest class of units"
+    elif model.hidden.real or not model.n_hidden or _visible_are_coupled(model):
+        return None
+    else:
+        n, most, what = log2_states(model.hidden), MOST_HIDDEN_BITS, "of the hidden layer, for each row"
+    return f"all 2^{n:.4g} states {what} are enumerated" if n <= most else None
+
+
+def exact(target: Target, n: int, *, generator: Generator) -> Tensor:
+    """Draw n independent states of the visible units for each row, ``(n_rows * n, n_visible)``, row by row."""
+    model = target.model
+    if target.v is not None:
+        n_numbers = model.hidden.n_states + n * model.n_visible
+        parts = target.parts(max(1, NUMBERS // n_numbers))
+        return torch.cat([_given(part, n, generator) for part in parts])
+    if isinstance(model, RBM):
+        return exact_samples(model, n, generator=generator, max_units=MOST_BITS + 1)
+    found = model.all_configurations()
+    assert found.weight is not None
+    number = _numbers(found.weight.double().log(), n, generator)
+    x = torch.cat((found.v, found.h), dim=-1)[number]
+    largest, _, _ = model.outside_largest_class()
+    x[:, largest.units] = largest.kind.sample(largest.field(x), generator=generator)
+    return x[:, : model.n_visible]
+
+
+def _given(target: Target, n: int, generator: Generator) -> Tensor:
+    model, v, observed = target.model, target.v, target.observed
+    assert v is not None
+    assert observed is not None
+    states = all_states(model.hidden, v)
+    number = _numbers(log_weight_of_hidden(model, v, observed, states).double(), n, generator).flatten()
+    drawn = model.visible.sample(visible_field(model, states[number]), generator=generator)
+    known, fixed = v.repeat_interleave(n, dim=0), observed.repeat_interleave(n, dim=0)
+    return torch.where(fixed, known, drawn)
+
+
+def _numbers(log_weight: Tensor, n: int, generator: Generator) -> Tensor:
+    """Draw n numbers of the last axis, ``(..., n)``, by inversion."""
+    below = torch.softmax(log_weight, dim=-1).cumsum(-1)
+    u = rng.uniform((*below.shape[:-1], n), generator=generator, like=below) * below[..., -1:]
+    return torch.searchsorted(below, u, right=True)
+
+
+def _visible_are_coupled(model: EnergyModel) -> bool:
+    pairs = model.quadratic_form().pairs
+    return pairs is not None and bool((pairs < model.n_visible).all(-1).any())
