@@ -23,6 +23,7 @@ from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.observed import visible_units_coupled
 
 QUICKLY_ENUMERATED = 16
 """Units that "auto" enumerates at most."""
@@ -231,6 +232,5 @@ def sums_missing(model: EnergyModel, observed: Tensor | None) -> bool:
     """Whether the likelihood of data with this mask can be computed."""
     if observed is None:
         return True
-    pairs, n = model.quadratic_form().pairs, model.n_visible
-    coupled = pairs is not None and bool((pairs < n).all(-1).any())
-    return not coupled and not model.hidden.real and log2_states(model.hidden) <= MOST_HIDDEN
+    few = not model.hidden.real and log2_states(model.hidden) <= MOST_HIDDEN
+    return few and not visible_units_coupled(model)

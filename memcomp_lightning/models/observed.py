@@ -32,14 +32,19 @@ def check_mask(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
     require(not len(half), f"observed entries of site {site}", "a part", "all entries of a site, or none")
 
 
+def visible_units_coupled(model: EnergyModel) -> bool:
+    """Whether visible units are coupled to each other: then they are not independent given the hidden ones."""
+    pairs = model.quadratic_form().pairs
+    return pairs is not None and bool((pairs < model.n_visible).all(-1).any())
+
+
 def visible_field(model: EnergyModel, h: Hidden) -> Visible:
     """Fields of the visible units given the hidden ones.
 
     Raises:
         SettingError: Visible units are coupled to each other.
     """
-    n, pairs = model.n_visible, model.quadratic_form().pairs
-    coupled = pairs is not None and bool((pairs < n).all(-1).any())
+    n, coupled = model.n_visible, visible_units_coupled(model)
     remedy = "Use positive=clamped_gibbs, which draws what is missing."
     require(not coupled, "couplings between visible units", True, "none where missing values are summed", remedy)
     x = torch.cat((h.new_zeros(*h.shape[:-1], n), h), dim=-1)

@@ -63,3 +63,49 @@ class DiscreteSites(NamedTuple):
     def values(self) -> Tensor:
         """What the entries are in each state, ``(n_sites, n_states, widest)``."""
         return self.low.unsqueeze(-2) + self.width.unsqueeze(-2) * self.high
+
+
+class Site(NamedTuple):
+    """One site of a layer.
+
+    Attributes:
+        entries: Its entries.
+        numbers: Data, as they are kept, of each of its states, those of a category being numbers from 0; None of a
+            real unit.
+    """
+
+    entries: list[int]
+    numbers: list[float] | None
+
+    @property
+    def is_category(self) -> bool:
+        """Whether its states have an entry each."""
+        return self.numbers is not None and len(self.numbers) == len(self.entries)
+
+    def probabilities(self, mean: Tensor) -> Tensor:
+        """Of its states, by the means of all entries of the layer, ``(n, n_entries)`` to ``(n, n_states)``."""
+        own = mean[..., self.entries]
+        if self.numbers is None or self.is_category:
+            return own
+        low, high = self.numbers
+        share = (own - low) / (high - low)
+        return torch.cat((1 - share, share), dim=-1)
+
+
+def sites_of(units: Units) -> list[Site]:
+    """The sites of a layer, in order.
+
+    Raises:
+        SettingError: The units have no form in bits.
+    """
+    form = units.bits()
+    at, low, width = form.at.tolist(), form.low.tolist(), form.width.tolist()
+    grouped = {bit for group in form.groups for bit in group}
+    found = {
+        at[group[0]]: Site([at[bit] for bit in group], [float(k) for k in range(len(group))])
+        for group in form.groups
+    }
+    found |= {at[k]: Site([at[k]], [low[k], low[k] + width[k]]) for k in range(len(at)) if k not in grouped}
+    discrete = set(at)
+    found |= {entry: Site([entry], None) for entry in range(units.n) if entry not in discrete}
+    return [found[entry] for entry in sorted(found)]
