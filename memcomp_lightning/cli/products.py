@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Generic, TypeVar
 
 from omegaconf import OmegaConf
@@ -88,6 +89,17 @@ class Usage(Generic[T]):
                 lines.append(f"      {line.strip()}")
         examples = [f"  {typed}\n      {does}" for typed, does in self.examples]
         return "\n".join([f"{self.command}: {self.purpose}", "", f"  {self.line}", "", *examples, "", *lines])
+
+
+def existing(path: str) -> Path:
+    """The path of a file that was typed.
+
+    Raises:
+        UserError: There is none.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"{path}: there is no such file.")
+    return Path(path)
 
 
 def carry_out(

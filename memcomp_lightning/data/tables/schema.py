@@ -84,9 +84,14 @@ class TableSchema:
         return [column.name for column in self.of_sites]
 
     @property
+    def log_scales(self) -> list[float]:
+        """Log of the scale of each site, 0 of those that are not real."""
+        return [math.log(column.scale) if isinstance(column, Real) else 0.0 for column in self.of_sites]
+
+    @property
     def log_scale(self) -> float:
         """Sum of the logs of the scales: what a log density of the units is above one in the user's units."""
-        return sum(math.log(column.scale) for column in self.columns if isinstance(column, Real))
+        return sum(self.log_scales)
 
     def units(self) -> Units:
         """Visible units for these columns."""
@@ -109,9 +114,12 @@ class TableSchema:
             complete: Whether every column of the schema must be there; one that is not is missing otherwise.
 
         Raises:
-            UserError: A column is not there, or a cell is not what its column can be.
+            UserError: A column is not there, or none of them is; a cell is not what its column can be.
         """
         names, n = set(batch.schema.names), batch.num_rows
+        if not names & set(self.site_names):
+            own, theirs = (", ".join(map(repr, some[:8])) for some in (self.site_names, batch.schema.names))
+            raise UserError(f"{file} has none of the columns of the model, which are {own}; it has {theirs}.")
         v = np.empty((n, self.n_sites), dtype=np.float32)
         for site, column in enumerate(self.of_sites):
             if column.name not in names:
@@ -139,6 +147,12 @@ class TableSchema:
         from memcomp_lightning.data.tables.table import read_rows
 
         return read_rows(path, self, complete=complete)
+
+    def filled(self, path: Path, v: Tensor) -> Columns:
+        """All columns of a file, its empty cells that the model has a number for filled with those of v."""
+        from memcomp_lightning.data.tables.filled import filled
+
+        return filled(path, self, v)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, from which :meth:`from_json` makes the schema again."""

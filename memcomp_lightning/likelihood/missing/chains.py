@@ -1,6 +1,5 @@
 """Missing values by Gibbs chains with the observed ones clamped."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,9 +8,9 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.missing.base import SHARES, Conditional, real_entries, width_of
+from memcomp_lightning.likelihood.missing.ladders import Ladders
 from memcomp_lightning.likelihood.missing.quantiles import mixture_quantile
-from memcomp_lightning.models.base import Block, EnergyModel
-from memcomp_lightning.models.rbm import scaled
+from memcomp_lightning.models.base import EnergyModel
 
 COMPONENTS = 32
 """Means of a chain that the quantiles of a real value are made of, evenly spaced over its sweeps."""
@@ -24,10 +23,10 @@ class _Sums(NamedTuple):
     """Sums over the sweeps of a round, float64.
 
     Attributes:
-        drawn: Of each half, of the values drawn, ``(2, rows, chains, n_visible)``.
+        drawn: Of each half, of the values drawn, ``(2, n_rows, n_chains, n_visible)``.
         square: Of their squares.
-        mean: Of the means from which they were drawn, over the chains as well, ``(rows, n_visible)``.
-        components: Some of these means of real units, ``(rows, chains * kept, n_real)``.
+        mean: Of the means from which they were drawn, over the chains as well, ``(n_rows, n_visible)``.
+        components: Some of these means of real units, ``(n_rows, n_chains * kept, n_real)``.
     """
 
     drawn: Tensor
@@ -40,10 +39,10 @@ class _Sums(NamedTuple):
 class MissingChains:
     r"""Several Gibbs chains a row, until they agree.
 
-    They begin at random and are cooled down, in half as many sweeps as the first round has: so they come to the
-    modes about as often as these weigh. They go on in rounds, each twice as long as the one before. A row whose
-    chains agree in a round, by the split R-hat of all its missing values (Gelman et al. 2013; 1 is agreement), is
-    done. What is told of a value are averages, over the sweeps of that round, of its mean given all other units:
+    They begin at random, are cooled down in half as many sweeps as the first round has, and go on in rounds, each
+    twice as long as the one before. A row whose chains agree in a round, by the split R-hat of all its missing values
+    (Gelman et al. 2013; 1 is agreement), is done. From the second round on each chain is the coldest of a ladder of
+    temperatures that exchange states (parallel tempering), which leave modes that a plain chain stays in. What is told of a value are averages, over the sweeps of that round, of its mean given all other units:
     they vary less than counts of what was drawn (Rao-Blackwell). A real value is taken to have the mixture of the
     normal distributions that it was drawn from.
 
@@ -52,12 +51,14 @@ class MissingChains:
         n_sweeps: Of the first round, an even number.
         most_sweeps: Of the last round at most.
         r_hat: What counts as agreement, > 1.
+        n_temperatures: Of a ladder, from 1 to infinity; 1 is none.
     """
 
     n_chains: int = 8
-    n_sweeps: int = 100
+    n_sweeps: int = 200
     most_sweeps: int = 1600
     r_hat: float = 1.05
+    n_temperatures: int = 10
 
     def __post_init__(self) -> None:
         require_count("n_chains", self.n_chains, 2)
@@ -65,11 +66,12 @@ class MissingChains:
         require(self.n_sweeps % 2 == 0, "n_sweeps", self.n_sweeps, "an even number")
         require_count("most_sweeps", self.most_sweeps, self.n_sweeps)
         require(self.r_hat > 1, "r_hat", self.r_hat, "a number > 1")
+        require_count("n_temperatures", self.n_temperatures)
 
     def numbers_a_row(self, model: EnergyModel, m: int) -> int:
         """States, masks and fields of the chains, sums in double precision, and components."""
         kept = COMPONENTS * len(real_entries(model.visible))
-        return max(self.n_chains, m) * (3 * model.n_units + 8 * model.n_visible + 2 * kept)
+        return max(self.n_chains, m) * (2 * self.n_temperatures * model.n_units + 8 * model.n_visible + 2 * kept)
 
     @torch.no_grad()
     def find(
@@ -78,30 +80,34 @@ class MissingChains:
         """What the chains say of the missing values; each draw is the last state of a chain of its own."""
         units, real = model.visible, real_entries(model.visible)
         n_chains = max(self.n_chains, m)
-        chains = _Chains.begun(model, v.to(model.b.dtype), observed, n_chains, generator)
+        ladders = Ladders.begun(model, v.to(model.b.dtype), observed, n_chains, generator)
         wide = v.double()
         nothing = torch.full((3, len(v), len(real)), torch.nan, dtype=torch.float64, device=v.device)
         found = Conditional(wide.clone(), nothing, wide.repeat(m, 1, 1), torch.full_like(wide[:, 0], torch.nan))
         n_first = self.n_sweeps // 2
         for sweep in range(n_first):
-            chains.sweep(generator, beta=(sweep + 1) / n_first)
+            ladders.sweep(generator, beta=(sweep + 1) / n_first)
         floor = _smallest_variance(model)
         rows, window = torch.arange(len(v), device=v.device), self.n_sweeps
         while len(rows):
-            sums = chains.swept(window, real, generator)
+            sums = _swept(ladders, window, real, generator)
             r_hat = _r_hat(sums, window // 2, floor).masked_fill(observed[rows], 1.0).amax(-1)
             last = 2 * window > self.most_sweeps
             done = (r_hat <= self.r_hat) | last
             at = rows[done]
             found.mean[at] = torch.where(observed[at], found.mean[at], sums.mean[done] / (window * n_chains))
             found.r_hat[at] = r_hat[done]
-            found.draws[:, at] = chains.visible()[done, :m].transpose(0, 1).double()
+            found.draws[:, at] = ladders.visible()[done, :m].transpose(0, 1).double()
             for column, entry in enumerate(real.tolist()):
                 missing = ~observed[at, entry]
                 component = sums.components[done][missing][..., column].double()
                 if len(component):
                     found.real[:, at[missing], column] = _of_mixture(component, width_of(units, entry))
-            rows, chains, window = rows[~done], chains.of(~done), 2 * window
+            rows, ladders, window = rows[~done], ladders.of(~done), 2 * window
+            if len(rows) and self.n_temperatures > 1 and len(ladders.betas) == 1:
+                ladders = ladders.heated(self.n_temperatures)
+                for sweep in range(n_first):
+                    ladders.sweep(generator, first=sweep % 2)
         return found
 
 
@@ -112,68 +118,23 @@ def _of_mixture(component: Tensor, width: float) -> Tensor:
     return torch.stack((deviation, *(mixture_quantile(weight, component, width, share) for share in SHARES)))
 
 
-class _Chains(NamedTuple):
-    """Chains of some rows: ``x`` holds all units, ``(rows * chains, n_units)``, ``fixed`` which are observed."""
-
-    model: EnergyModel
-    blocks: Sequence[Block]
-    x: Tensor
-    fixed: Tensor
-    n_chains: int
-
-    @classmethod
-    def begun(
-        cls, model: EnergyModel, v: Tensor, observed: Tensor, n_chains: int, generator: Generator
-    ) -> "_Chains":
-        """Chains that begin as at infinite temperature."""
-        v, observed = (x.repeat_interleave(n_chains, dim=0) for x in (v, observed))
-        alone = model.visible.sample(torch.zeros_like(v), generator=generator)
-        h = model.hidden.sample(v.new_zeros(len(v), model.n_hidden), generator=generator)
-        x = torch.cat((torch.where(observed, v, alone), h), dim=-1)
-        fixed = torch.cat((observed, torch.zeros_like(h, dtype=torch.bool)), dim=-1)
-        return cls(model, model.blocks(), x, fixed, n_chains)
-
-    def visible(self) -> Tensor:
-        """Visible units, ``(rows, chains, n_visible)``."""
-        return self.x[:, : self.model.n_visible].reshape(-1, self.n_chains, self.model.n_visible)
-
-    def of(self, rows: Tensor) -> "_Chains":
-        """Those of some rows."""
-        every = rows.repeat_interleave(self.n_chains)
-        return self._replace(x=self.x[every], fixed=self.fixed[every])
-
-    def sweep(self, generator: Generator, *, beta: float = 1.0) -> Tensor:
-        """Draw all that is not observed, in place; return the means from which the visible units were drawn."""
-        x, n = self.x, self.model.n_visible
-        means = x.new_zeros(len(x), n)
-        # The hidden units follow the start of the visible ones, not the other way round.
-        for block in sorted(self.blocks, key=lambda block: bool((block.units < n).any())):
-            at, field = block.units, scaled(block.field(x), beta)
-            seen, new = at < n, block.kind.sample(field, generator=generator)
-            if bool(seen.any()):
-                new = torch.where(self.fixed[:, at], x[:, at], new)
-                means[:, at[seen]] = block.kind.mean(field)[:, seen]
-            x[:, at] = new
-        return means
-
-    def swept(self, n_sweeps: int, real: Tensor, generator: Generator) -> _Sums:
-        """Sweep all chains, and add up what they show."""
-        x, n = self.x, self.model.n_visible
-        n_rows, half = len(x) // self.n_chains, n_sweeps // 2
-        kept: list[Tensor] = []
-        drawn, square = x.new_zeros(2, 2, len(x), n, dtype=torch.float64)
-        total, every = x.new_zeros(len(x), n, dtype=torch.float64), max(1, n_sweeps // COMPONENTS)
-        for sweep in range(n_sweeps):
-            means = self.sweep(generator)
-            drawn[sweep // half] += x[:, :n]
-            square[sweep // half] += x[:, :n].square()
-            total += means
-            if sweep % every == 0 and len(kept) < COMPONENTS:
-                kept.append(means[:, real])
-        components = torch.stack(kept, dim=1).view(n_rows, self.n_chains * len(kept), len(real))
-        shape = (2, n_rows, self.n_chains, n)
-        total = total.view(shape[1:]).sum(1)
-        return _Sums(drawn.view(shape), square.view(shape), total, components)
+def _swept(ladders: Ladders, n_sweeps: int, real: Tensor, generator: Generator) -> _Sums:
+    """Sweep all chains, and add up what they show."""
+    n, n_rows, half = ladders.model.n_visible, ladders.n // ladders.n_chains, n_sweeps // 2
+    drawn, square = ladders.x.new_zeros(2, 2, ladders.n, n, dtype=torch.float64)
+    total, every = torch.zeros_like(drawn[0]), max(1, n_sweeps // COMPONENTS)
+    kept: list[Tensor] = []
+    for sweep in range(n_sweeps):
+        means = ladders.sweep(generator, first=sweep % 2)
+        now = ladders.x[: ladders.n, :n]
+        drawn[sweep // half] += now
+        square[sweep // half] += now.square()
+        total += means
+        if sweep % every == 0 and len(kept) < COMPONENTS:
+            kept.append(means[:, real])
+    components = torch.stack(kept, dim=1).view(n_rows, ladders.n_chains * len(kept), len(real))
+    shape = (2, n_rows, ladders.n_chains, n)
+    return _Sums(drawn.view(shape), square.view(shape), total.view(shape[1:]).sum(1), components)
 
 
 def _smallest_variance(model: EnergyModel) -> Tensor:

@@ -146,7 +146,7 @@ def test_draws_are_joint_and_keep_what_is_known(way: Any) -> None:
 
 
 def test_chains_that_stay_apart_say_so() -> None:
-    """Two patterns that no chain leaves: R-hat is far above 1, and is 1 where the known spins decide."""
+    """Two patterns that no chain leaves: R-hat is far above 1, unless known spins decide, or temperatures help."""
     model = small_rbm(visible=Spin(8), hidden=Spin(1))
     with torch.no_grad():
         model.weight.fill_(4.0)
@@ -154,10 +154,14 @@ def test_chains_that_stay_apart_say_so() -> None:
         model.c.fill_(0.0)
     v, observed = torch.ones(2, 8), torch.zeros(2, 8, dtype=torch.bool)
     observed[1, :4] = True
-    found = find(MissingChains(most_sweeps=200), model, v, observed)
-    assert found.r_hat[0] > 2
-    assert found.r_hat[1] < 1.05
-    assert bool((found.mean[1, 4:] > 0.99).all())
+    alone = find(MissingChains(n_temperatures=1, most_sweeps=400), model, v, observed)
+    assert alone.r_hat[0] > 2
+    tempered = find(MissingChains(), model, v, observed)
+    assert tempered.r_hat[0] < 1.1
+    assert bool((tempered.mean[0].abs() < 0.2).all())
+    for found in (alone, tempered):
+        assert found.r_hat[1] < 1.05
+        assert bool((found.mean[1, 4:] > 0.99).all())
 
 
 def test_each_row_is_found_by_the_shortest_way() -> None:

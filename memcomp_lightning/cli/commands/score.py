@@ -1,0 +1,87 @@
+"""``memcomp-score``: how likely the rows of a table are, and which class they have."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from memcomp_lightning.cli.output import say
+from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.data.written import check_output, write_columns
+from memcomp_lightning.trained import load
+from memcomp_lightning.trained.partition import Annealing
+from memcomp_lightning.trained.scoring import Scores, score
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of ``memcomp-score``.
+
+    Attributes:
+        output: File for the scores: .csv, .tsv, .parquet or .npz.
+        pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
+        chains: Chains of AIS, which estimates log Z where it cannot be enumerated.
+        betas: Its steps at most.
+        seed: Of what is drawn.
+        overwrite: Whether a file that is there is replaced.
+        replica: Which of the networks of a run with data.partitions, from 0.
+    """
+
+    output: str = "scores.csv"
+    pseudo: bool = True
+    chains: int = 100
+    betas: int = 16_000
+    seed: int = 0
+    overwrite: bool = False
+    replica: int | None = None
+
+
+USAGE = Usage(
+    "memcomp-score",
+    "write the log-likelihood of each row of a table, and its class.",
+    ("RUN", "TABLE"),
+    Settings,
+    [("memcomp-score runs/people people.csv", "log-likelihoods and class probabilities, in scores.csv")],
+)
+
+
+def act(places: Sequence[str], settings: Settings) -> None:
+    """Score a file."""
+    output = Path(settings.output)
+    check_output(output, overwrite=settings.overwrite)
+    annealing = Annealing(
+        n_chains=settings.chains, n_betas=min(Annealing().n_betas, settings.betas), most_betas=settings.betas
+    )
+    run, table = load(places[0], replica=settings.replica), existing(places[1])
+    rows = run.needed_schema.read(table, complete=False)
+    found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
+    write_columns(found.columns, output, overwrite=settings.overwrite)
+    say(_summary(found, settings))
+    say(f"written: {output}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point."""
+    carry_out(USAGE, act, arguments)
+
+
+def _summary(found: Scores, settings: Settings) -> str:
+    """What was found, and how far it can be trusted."""
+    n = len(found.columns["row"])
+    lines = [f"{n:,} rows"]
+    if found.log_z is not None:
+        of_rows = found.columns["log_likelihood"]
+        of_rows = of_rows[~np.isnan(of_rows)]
+        if len(of_rows) > 1:
+            error = of_rows.std(ddof=1) / len(of_rows) ** 0.5
+            lines[0] += f", mean log-likelihood {of_rows.mean():.4f} ± {error:.2g} nats (standard error over rows)"
+        lines.append(f"{found.log_z}, {found.seconds:.1f} s")
+        if not found.log_z.trusted:
+            lines.append(
+                f"log Z is not settled, its error is larger than it says: type betas={4 * settings.betas}; "
+                "rows can still be compared with each other"
+            )
+    if found.accuracy is not None:
+        lines.append(f"accuracy on labelled rows without gaps: {found.accuracy:.4f}")
+    return "\n".join([*lines, *found.notes])

@@ -1,0 +1,170 @@
+"""How likely rows are under a trained model, and which class they have."""
+
+import math
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.data.rows import UNLABELLED, Rows
+from memcomp_lightning.data.schema import Columns
+from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.likelihood import log_likelihood_or_bound, log_pseudo_likelihood
+from memcomp_lightning.likelihood.missing import of_observed
+from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy
+from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.trained.partition import Annealing, LogZ, log_z_of
+from memcomp_lightning.trained.run import Run
+from memcomp_lightning.trained.values import values
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of rows.
+
+    Attributes:
+        columns: ``row``, from 1, and what :func:`score` says.
+        log_z: Log Z and how it was found; None where there is no likelihood.
+        seconds: That it took to find it.
+        accuracy: Share of the labelled rows without gaps whose class is right; None without any.
+        notes: What was left out, and why, a sentence each.
+    """
+
+    columns: Columns
+    log_z: LogZ | None
+    seconds: float
+    accuracy: float | None
+    notes: list[str]
+
+
+@torch.no_grad()
+def score(
+    run: Run, rows: Rows, *, pseudo: bool = True, annealing: Annealing | None = None, seed: int = 0
+) -> Scores:
+    r"""Score rows, as columns.
+
+    * ``log_likelihood``: log p(v) in nats; of rows with gaps log p(observed values). Of real columns it is the log
+      of a density in the user's units.
+    * ``log_likelihood_error``: its standard error, where log Z or a sum over missing values is estimated. The
+      error of log Z is one and the same for all rows.
+    * ``free_energy``: F, so that ``log_likelihood`` is -F - log Z, in the units of the model.
+    * ``pseudo_log_likelihood``: :math:`\sum_j \log p(v_j | v_{-j})`, which needs no log Z; NaN of rows with gaps.
+    * ``p(CLASS)`` and ``class`` of the fine-tuned network, if there is one; empty for rows with gaps.
+
+    Args:
+        run: A trained run.
+        rows: To score; whole rows may be missing.
+        pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
+        annealing: Settings of AIS.
+        seed: Of what is drawn.
+
+    Raises:
+        UserError, SettingError: The run has neither an energy model nor a classifier; values that have no
+            likelihood, in a run without a classifier.
+    """
+    v, observed = values(run, rows)
+    whole = torch.ones(len(v), dtype=torch.bool) if rows.observed is None else rows.observed.all(-1)
+    columns: Columns = {"row": np.arange(1, len(v) + 1)}
+    notes: list[str] = []
+    log_z, seconds = None, 0.0
+    try:
+        model = run.model
+        model.visible.check(v, observed, pure=True)
+    except (UserError, SettingError) as error:
+        if run.classifier is None:
+            raise
+        notes.append(f"no likelihoods: {error}")
+    else:
+        begin = time.perf_counter()
+        try:
+            log_z = log_z_of(model, annealing=annealing, seed=seed)
+        except UserError as error:
+            notes.append(f"no log_likelihood: {error}")
+        seconds = time.perf_counter() - begin
+        columns |= _likelihoods(run, model, _Given(rows, v, observed, whole), log_z, notes, seed)
+        if pseudo:
+            columns |= _pseudo_likelihoods(run, model, v, whole, notes)
+    accuracy = None
+    if run.classifier is not None:
+        of_classes, accuracy = _classes(run, rows, v, whole)
+        columns |= of_classes
+        if not bool(whole.all()):
+            notes.append(
+                f"{int((~whole).sum()):,} rows with gaps have no class: fill them first, with memcomp-impute"
+            )
+    return Scores(columns, log_z, seconds, accuracy, notes)
+
+
+class _Given(NamedTuple):
+    """Rows, their values and masks of the visible units, and which have no gaps."""
+
+    rows: Rows
+    v: Tensor
+    observed: Tensor | None
+    whole: Tensor
+
+
+def _likelihoods(
+    run: Run, model: EnergyModel, given: _Given, log_z: LogZ | None, notes: list[str], seed: int
+) -> Columns:
+    """Log-likelihoods and free energies."""
+    rows, v, observed, whole = given
+    minus_free, error = torch.full((2, len(v)), torch.nan, dtype=torch.float64)
+    error[whole] = 0.0
+    at = whole.nonzero().flatten()
+    if len(at):
+        minus_free[at] = log_likelihood_or_bound(model, v[at], v.new_zeros((), dtype=torch.float64))
+    if model.n_hidden > MOST_HIDDEN and not has_free_energy(model):
+        notes.append("log_likelihood is a lower bound, in the mean field: hidden units are coupled to each other")
+    at = (~whole).nonzero().flatten()
+    if observed is not None and len(at):
+        try:
+            minus_free[at], error[at] = of_observed(model, v[at], observed[at], generator=rng.stream(seed, "gaps"))
+        except SettingError as reason:
+            notes.append(f"no likelihoods of rows with gaps: {reason}")
+    found: dict[str, Tensor] = {}
+    if log_z is not None:
+        found["log_likelihood"] = minus_free - log_z.value - _log_scale(run, rows)
+        error = (error.square() + log_z.error**2).sqrt()
+        if bool((error > 0).any()):
+            found["log_likelihood_error"] = error
+    found["free_energy"] = -minus_free
+    return {name: column.numpy() for name, column in found.items()}
+
+
+def _log_scale(run: Run, rows: Rows) -> Tensor:
+    """What a log density of the units of each row is above one in the user's units, of what is observed."""
+    scales = torch.tensor(getattr(run.needed_schema, "log_scales", [0.0] * rows.v.shape[-1]), dtype=torch.float64)
+    return scales.sum() if rows.observed is None else rows.observed.double() @ scales
+
+
+def _pseudo_likelihoods(run: Run, model: EnergyModel, v: Tensor, whole: Tensor, notes: list[str]) -> Columns:
+    found = torch.full((len(v),), torch.nan, dtype=torch.float64)
+    try:
+        if bool(whole.any()):
+            found[whole] = log_pseudo_likelihood(model, v[whole]).sum(-1) - run.needed_schema.log_scale
+    except SettingError as reason:
+        notes.append(f"no pseudo-likelihoods: {reason}")
+        return {}
+    return {"pseudo_log_likelihood": found.numpy()}
+
+
+def _classes(run: Run, rows: Rows, v: Tensor, whole: Tensor) -> tuple[Columns, float | None]:
+    """Probabilities of the classes, the likeliest one, and the share that is right."""
+    assert run.classifier is not None
+    names = run.needed_schema.class_names
+    p = torch.full((len(v), len(names)), torch.nan)
+    if bool(whole.any()):
+        some = v[whole].to(next(run.classifier.parameters()))
+        p[whole] = torch.softmax(torch.cat([run.classifier(part) for part in some.split(4096)]).float(), dim=-1)
+    best = p.argmax(-1)
+    of_class = np.array([names[k] for k in best.tolist()], dtype=object)
+    of_class[~whole.numpy()] = None
+    columns: Columns = {f"p({name})": p[:, k].numpy() for k, name in enumerate(names)}
+    known = whole & (rows.label != UNLABELLED)
+    right = float((best == rows.label)[known].double().mean()) if bool(known.any()) else math.nan
+    return columns | {"class": of_class}, None if math.isnan(right) else right
