@@ -274,7 +274,9 @@ class EnergyPretraining(StageModule):
         """Begin with what an earlier training left."""
         assert self.earlier is not None
         kept, said = self.earlier["models"].get(self.phase.name), "begin anew, because none were kept"
-        if kept is not None and self.trainer.world_size == 1:
+        if self.trainer.world_size > 1:
+            said = "begin anew, because each process has its own"
+        elif kept is not None:
             generator = rng.stream(self.seed, "check")
             self._state, said = state_of(kept, step, self.model, n, generator=generator)
         self.chains[self.phase.name] = said
