@@ -9,8 +9,13 @@ from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.written import ENDINGS, check_output, write_columns
 from memcomp_lightning.errors import UserError, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
+from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
 from memcomp_lightning.trained.imputation import Imputation, completed_columns, gap_columns, impute
+from memcomp_lightning.trained.masking import figure_of_imputation, masked
+
+HIDDEN = 0.1
+"""Share of the known cells that is hidden for figures."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +28,8 @@ class Settings:
             discrete columns and the means of real ones.
         probabilities: File with a row for each gap: row, column, value, probability, deviation, low, high; null
             is none.
+        figures: Folder, .png or .pdf: a tenth of the known cells is hidden, and what is filled in is drawn beside
+            what was there.
         seed: Of chains and draws.
         chains: Gibbs chains of each row, where there are too many hidden units for exact sums.
         sweeps: Sweeps of the last round of these chains at most.
@@ -33,6 +40,7 @@ class Settings:
     output: str = "filled.csv"
     m: int | None = None
     probabilities: str | None = None
+    figures: str | None = None
     seed: int = 0
     chains: int = 8
     sweeps: int = 1600
@@ -63,6 +71,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
         check_output(path, overwrite=settings.overwrite)
     if gaps in outputs:
         raise UserError(f"probabilities={gaps}: the completed table goes there. Choose another file.")
+    if settings.figures is not None:
+        check_figures(Path(settings.figures), overwrite=settings.overwrite)
     run, table = load(places[0], replica=settings.replica), existing(places[1])
     chains = MissingChains(n_chains=settings.chains, most_sweeps=settings.sweeps)
     rows = run.needed_schema.read(table, complete=False)
@@ -72,6 +82,10 @@ def act(places: Sequence[str], settings: Settings) -> None:
         write_columns(completed_columns(run.needed_schema, table, v), path, overwrite=settings.overwrite)
     if gaps is not None:
         write_columns(gap_columns(run.needed_schema, found), gaps, overwrite=settings.overwrite)
+    if settings.figures is not None:
+        hidden = impute(run, masked(rows, HIDDEN, seed=settings.seed), seed=settings.seed, chains=chains)
+        figures = {"imputation": figure_of_imputation(run.needed_schema, rows, hidden.gaps)}
+        write_figures(figures, Path(settings.figures), overwrite=settings.overwrite)
     say(_summary(found, chains, run.needed_schema.site_names))
     say(f"written: {', '.join(map(str, [*outputs, *([] if gaps is None else [gaps])]))}")
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out
+from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
 from memcomp_lightning.data.written import SEQUENCE, check_output, write_columns
@@ -41,6 +41,8 @@ class Settings:
         overwrite: Whether files that are there are replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
         figure: A .png of the first 100, where rows are pictures.
+        figures: Folder, .png or .pdf for figures of the rows beside those of data=TABLE.
+        data: The table that figures compare with, say the one that was trained on.
     """
 
     n: int | None = None
@@ -53,6 +55,8 @@ class Settings:
     overwrite: bool = False
     replica: int | None = None
     figure: str | None = None
+    figures: str | None = None
+    data: str | None = None
 
 
 USAGE = Usage(
@@ -67,6 +71,10 @@ USAGE = Usage(
         ),
         ("memcomp-sample runs/people given='{age: 30, sex: f}'", "other columns of rows with these values"),
         ("memcomp-sample runs/people given=gaps.csv output=whole.csv", "a table with its gaps filled by draws"),
+        (
+            "memcomp-sample runs/people data=people.csv figures=looks",
+            "marginals, correlations and principal components beside the data's",
+        ),
         ("memcomp-sample runs/digits output=digits.npz figure=digits.png", "pictures"),
     ],
 )
@@ -80,6 +88,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     schema = run.needed_schema
     _check_kind(output, schema)
     figure = None if settings.figure is None else _checked_figure(settings, schema)
+    beside = _beside(settings, schema)
     given = _given(settings, schema)
     of_file = isinstance(settings.given, str)
     begin = time.perf_counter()
@@ -94,6 +103,12 @@ def act(places: Sequence[str], settings: Settings) -> None:
     )
     seconds = time.perf_counter() - begin
     write_columns(_columns(v, schema, output), output, overwrite=settings.overwrite)
+    if beside is not None:
+        from memcomp_lightning.plotting.written import write_figures
+        from memcomp_lightning.trained.figures import figures_of
+
+        figures = figures_of(run, beside, v, seed=settings.seed)
+        write_figures(figures, Path(str(settings.figures)), overwrite=settings.overwrite)
     if figure is not None and isinstance(schema, ImageSchema):
         _draw(v, schema, figure)
     say(f"{len(v):,} rows in {seconds:.1f} s: {output}")
@@ -114,6 +129,18 @@ def _given(settings: Settings, schema: Schema) -> Rows | None:
             )
         return schema.read(file, complete=False)
     return given_row(schema, settings.given)
+
+
+def _beside(settings: Settings, schema: Schema) -> Rows | None:
+    """The rows that figures compare with; None without figures."""
+    if settings.figures is None:
+        return None
+    if settings.data is None:
+        raise UserError(f"figures={settings.figures} needs a table to compare with: type data=TABLE.")
+    from memcomp_lightning.plotting.written import check_figures
+
+    check_figures(Path(settings.figures), overwrite=settings.overwrite)
+    return schema.read(existing(settings.data), complete=False)
 
 
 def _check_kind(output: Path, schema: Schema) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.written import check_output, write_columns
+from memcomp_lightning.plotting import plot_likelihoods
+from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
 from memcomp_lightning.trained.partition import Annealing
 from memcomp_lightning.trained.scoring import Scores, score
@@ -23,6 +25,7 @@ class Settings:
         pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
         chains: Chains of AIS, which estimates log Z where it cannot be enumerated.
         betas: Its steps at most.
+        figures: Folder, .png or .pdf for a histogram of the log-likelihoods.
         seed: Of what is drawn.
         overwrite: Whether a file that is there is replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
@@ -32,6 +35,7 @@ class Settings:
     pseudo: bool = True
     chains: int = 100
     betas: int = 16_000
+    figures: str | None = None
     seed: int = 0
     overwrite: bool = False
     replica: int | None = None
@@ -50,6 +54,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Score a file."""
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite)
+    if settings.figures is not None:
+        check_figures(Path(settings.figures), overwrite=settings.overwrite)
     annealing = Annealing(
         n_chains=settings.chains, n_betas=min(Annealing().n_betas, settings.betas), most_betas=settings.betas
     )
@@ -57,6 +63,9 @@ def act(places: Sequence[str], settings: Settings) -> None:
     rows = run.needed_schema.read(table, complete=False)
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
     write_columns(found.columns, output, overwrite=settings.overwrite)
+    if settings.figures is not None:
+        drawn = plot_likelihoods({"rows": found.columns["log_likelihood"]})
+        write_figures({"likelihoods": drawn}, Path(settings.figures), overwrite=settings.overwrite)
     say(_summary(found, settings))
     say(f"written: {output}")
 

@@ -1,4 +1,4 @@
-"""Gibbs chains of many rows with what is observed clamped, at one temperature or at several that exchange states."""
+"""Gibbs chains of many rows with what is observed clamped, at one temperature or several that exchange states."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
