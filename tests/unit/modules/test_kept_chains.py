@@ -1,5 +1,6 @@
 """A training that goes on from another: its chains, its centres, its random streams."""
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,16 +39,24 @@ class Stops(pl.Callback):
             trainer.save_checkpoint(self.path)
 
 
-def module(weights: DBN | None = None, seed: int = 0, sampler: Any = None, **settings: Any) -> EnergyPretraining:
-    dbn = DBN(9, [4, 3])
+def module(
+    weights: DBN | None = None, *, sizes: Sequence[int] = (4, 3), iterations: int = 2, **settings: Any
+) -> EnergyPretraining:
+    dbn = DBN(9, sizes)
     if weights is not None:
         dbn.load_state_dict(weights.state_dict())
     optimizer = partial(torch.optim.SGD, lr=0.1)
-    sampler = sampler or PCD(n_chains=6)
-    return EnergyPretraining(Greedy(dbn), sampler, iterations=2, optimizer=optimizer, seed=seed, **settings)
+    sampler = PCD(n_chains=6)
+    return EnergyPretraining(Greedy(dbn), sampler, iterations=iterations, optimizer=optimizer, **settings)
 
 
-def fit(made: EnergyPretraining, folder: Path, resume: Path | None = None, also: Any = ()) -> EnergyPretraining:
+def fit(
+    made: EnergyPretraining,
+    folder: Path,
+    resume: Path | None = None,
+    also: Any = (),
+    batch_size: int | None = 5,
+) -> EnergyPretraining:
     trainer = pl.Trainer(
         max_epochs=made.n_epochs,
         accelerator="cpu",
@@ -58,7 +67,7 @@ def fit(made: EnergyPretraining, folder: Path, resume: Path | None = None, also:
         default_root_dir=folder,
         **QUIET,
     )
-    data = ImageDataModule(ShiftingBars(copies=2).load(), batch_size=5)
+    data = ImageDataModule(ShiftingBars(copies=2).load(), batch_size=batch_size)
     trainer.fit(made, datamodule=data, ckpt_path=resume, weights_only=True)
     return made
 
@@ -69,6 +78,19 @@ def same(one: Any, other: Any) -> bool:
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(x, other[name]) for name, x in one.items())
     return bool(one == other)
+
+
+@pytest.mark.parametrize("centring", [None, Centring(rate=0.1)])
+def test_an_update_of_the_chains_that_go_on_is_that_of_the_longer_training(
+    tmp_path: Path, centring: Centring | None
+) -> None:
+    """With all images in an update, whose order says nothing."""
+    whole: dict[str, Any] = {"sizes": [4], "centring": centring}
+    long = fit(module(iterations=4, **whole), tmp_path, batch_size=None)
+    short = fit(module(iterations=3, **whole), tmp_path, batch_size=None)
+    more = module(short.network, iterations=1, earlier=short.left(), **whole)
+    assert same(fit(more, tmp_path, batch_size=None).network.state_dict(), long.network.state_dict())
+    assert same(more.left(), long.left())
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
