@@ -400,7 +400,7 @@ def _loaded(config: DictConfig, schema: Schema | None = None) -> "Data":
     """The data of a run; what is not images has a schema of its own, or takes that of an earlier run."""
     source = instantiate(config.data.source)
     require_parts("data.source", source, "source of data", ("load",))
-    if schema is not None and hasattr(source, "schema"):
+    if schema is not None and schema.as_json()["data"] == "table" and hasattr(source, "schema"):
         source = replace(source, schema=schema)
     data = _load_once(source) if isinstance(source, Hashable) else source.load()
     is_data, kind = isinstance(data, ImageData) or hasattr(data, "schema"), type(data).__name__
