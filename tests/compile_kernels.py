@@ -11,13 +11,14 @@ from memcomp_lightning import rng
 from memcomp_lightning.likelihood import log_partition_function
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.solvers import BranchAndBound, CrossoverAnnealing, GibbsAnnealing, TabuSearch
-from memcomp_lightning.solvers.dmm import DmmSolver
+from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver
 from memcomp_lightning.testing import small_rbm
 
 
 def lanes():
     problem, generator = Qubo.from_matrix(torch.ones(2, 2)), rng.stream(0, "compile")
-    DmmSolver(n_restarts=1, max_steps=1).minimise(problem, generator=generator)
+    for field in (ClauseField(), BondField()):
+        DmmSolver(field=field, n_restarts=1, max_steps=1).minimise(problem, generator=generator)
 
 
 def others():

@@ -230,9 +230,9 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
     """Run a QUBO solver on small problems of every layout and check the contract.
 
     Checked: shapes, assignments in {0, 1}, energies in float64 that are those of the assignments and never
-    below the true minimum, the same answer from the same stream, no draw from the global stream; the true
-    minimum unless told otherwise; and extreme problems: no couplings, one variable, all zeros, weights of
-    1e-30 and 1e30.
+    below the true minimum, the same answer from the same stream, no draw from the global stream, the problem left
+    alone; the true minimum unless told otherwise; and extreme problems: no couplings, one variable, all zeros,
+    weights of 1e-30 and 1e30.
 
     Raises:
         AssertionError: Naming what the solver got wrong.
@@ -253,10 +253,12 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
     }
     for label, qubo in problems.items():
         exact = BruteForce().minimise(qubo, generator=rng.stream(0, "unused")).best_energy
-        global_state = torch.get_rng_state()
+        global_state, before = torch.get_rng_state(), [part.clone() for part in _numbers(qubo)]
         solution, again = (solver.minimise(qubo, generator=rng.stream(5, "solver")) for _ in range(2))
         where = f"{name} on {label}"
         _check(global_state.equal(torch.get_rng_state()), f"{where} drew from torch's global random stream")
+        unchanged = all(a.equal(b) for a, b in zip(before, _numbers(qubo), strict=True))
+        _check(unchanged, f"{where} changed the problem")
         shape = solution.energies.shape
         _check(shape[:-1] == qubo.problems, f"{where}: energies have shape {tuple(shape)}")
         _check(solution.assignments.shape == (*shape, qubo.n), f"{where}: assignments of another shape")
@@ -273,6 +275,10 @@ def check_solver(solver: QuboSolver, *, finds_optimum: bool = True) -> None:
             _check(bool((solution.best_energy <= exact + tolerance).all()), f"{where}: minimum not found")
         fit = solution.status.shape == shape and solution.steps.shape == shape
         _check(fit, f"{where}: status or steps of another shape than energies")
+
+
+def _numbers(qubo: Qubo) -> tuple[Tensor, ...]:
+    return qubo.coupling, qubo.linear, qubo.offset
 
 
 def _check(condition: bool, message: str) -> None:

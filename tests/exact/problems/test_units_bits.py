@@ -44,7 +44,8 @@ def log_integral(model, x):
     n, total = model.n_visible, -model.energy(x[:, : model.n_visible], x[:, model.n_visible :])
     exact = enumerated(model)
     for unit in exact.variance.nonzero().flatten().tolist():
-        t = torch.linspace(-40, 40, 4001, dtype=torch.float64)
+        # The rule of trapezes: of a normal density as wide as two steps it is right to all digits.
+        t = torch.linspace(-40, 40, 321, dtype=torch.float64)
         wide = x[:, None, :].repeat(1, len(t), 1)
         wide[..., unit] = t
         at_zero = x.clone()

@@ -369,16 +369,16 @@ print(*({HEAVY | besides} & sys.modules.keys()), file=sys.stderr)
     "solver",
     [
         AlternatingDescent(),
-        GibbsAnnealing(),
-        GibbsAnnealing(kernel="reference"),
+        GibbsAnnealing(n_sweeps=5),
+        GibbsAnnealing(n_sweeps=5, kernel="reference"),
         TabuSearch(n_steps=5),
         TabuSearch(n_steps=5, kernel="reference"),
-        CrossoverAnnealing(n_sweeps=5, n_rounds=2),
-        CrossoverAnnealing(n_sweeps=5, n_rounds=2, kernel="reference"),
-        DmmSolver(),
-        DmmSolver(kernel="reference"),
+        CrossoverAnnealing(n_sweeps=2, n_rounds=2),
+        CrossoverAnnealing(n_sweeps=2, n_rounds=2, kernel="reference"),
+        DmmSolver(n_restarts=6, max_steps=20),
+        DmmSolver(n_restarts=6, max_steps=20, kernel="reference"),
     ],
-    ids=str,
+    ids=lambda solver: f"{type(solver).__name__}, {getattr(solver, 'kernel', 'plain')}",
 )
 def test_whole_numbers_are_searched_as_real_ones(solver, library):
     numbers = np.random.default_rng(0).integers(-9, 10, (40, 40))

@@ -1,6 +1,5 @@
 """The compiled kernels: hand arrays to numba and share the restarts among threads."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -36,7 +35,8 @@ announce_compilation()
 
 Steps = tuple[int, int, int, int, float]
 
-_INLINED = (common, digital, *(sys.modules[passes.advance.py_func.__module__] for passes in FIELDS.values()))
+_INLINED = (common, digital, lanes)
+"""Modules whose functions become part of kernels that are kept on disk: those of other packages do not."""
 
 
 def run(

@@ -432,7 +432,8 @@ def integrate_all(begin, end, stop, problem, control, start, steps, best, found_
         )
 
 
-@njit(nogil=True, cache=True, fastmath=FAST_MATH, forceinline=True)
+# Not kept on disk by itself: with passes of another package it would be, once more in each process.
+@njit(nogil=True, fastmath=FAST_MATH, forceinline=True)
 def integrate(
     problem,
     digital,

@@ -5,11 +5,13 @@ import dataclasses
 import inspect
 import os
 import re
+import runpy
 import time
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -646,8 +648,10 @@ def test_outdated_kernels_are_removed_though_another_process_does_so_too(tmp_pat
 # --- a field of another package -----------------------------------------------------------------------------
 
 
-def test_passes_of_the_page_take_the_same_steps():
+def test_passes_of_the_page_take_the_same_steps(monkeypatch):
     """The example of docs/extending.md: one row of the table, and the kernel integrates its field."""
+    # Compiled here and now: most of the time would be that of making it fast.
+    monkeypatch.setattr(numba.config, "OPT", 0)
     page = (Path(__file__).parents[4] / "docs/extending.md").read_text(encoding="utf-8")
     (block,) = [b for b in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL) if "class Gradient" in b]
     made = {}
@@ -657,8 +661,19 @@ def test_passes_of_the_page_take_the_same_steps():
         for name in ("listed", "bipartite 17 + 11"):
             begin = start(PROBLEMS[name], 17, field)
             alike(PROBLEMS[name], *both(field, PROBLEMS[name], begin, n_steps=20, quench_every=3))
+        kept = [part for part in vars(lanes).values() if isinstance(part, Dispatcher) and part.stats.cache_path]
+        assert "Downhill" not in str([part.signatures for part in kept]), "on disk it is of no use to anybody"
+        runpy.run_path(cpu.__file__)  # imported for the first time after the field is there
     finally:
         del compiled_fields.FIELDS[made["Gradient"]]
+
+
+def test_outdated_passes_of_our_own_fields_are_found():
+    """Wherever they lie, a change of them makes the kernels on disk old."""
+    of_fields = {
+        part.py_func.__module__ for row in compiled_fields.FIELDS.values() for part in (row.start, row.advance)
+    }
+    assert of_fields <= {module.__name__ for module in cpu._INLINED}
 
 
 # --- the same code in every process ------------------------------------------------------------------------
