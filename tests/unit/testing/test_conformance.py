@@ -102,7 +102,7 @@ SAMPLERS = {
         readout="time_average",
     ),
 }
-# How a solver works is none of the sampler's business, so these stand for all: restarts that are not run and records.
+# How a solver works is none of the sampler's business: these stand for all, with restarts not run, and records.
 GROUND_STATES = {
     f"ground state by {name}": GroundState(solver=SOLVERS[name])
     for name in ("DMM", "DMM with both", "DMM with warm restarts", "annealing", "brute force")
