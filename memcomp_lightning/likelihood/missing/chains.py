@@ -42,10 +42,10 @@ class MissingChains:
     They begin at random, are cooled down in half as many sweeps as the first round has, and go on in rounds, each
     twice as long as the one before. A row whose chains agree in a round, by the split R-hat of all its missing
     values (Gelman et al. 2013; 1 is agreement), is done. From the second round on each chain is the coldest of a
-    ladder of temperatures that exchange states (parallel tempering), so that it leaves modes. What is told of a
-    value are averages, over the sweeps of that round, of its mean given all other units: they vary less than
-    counts of what was drawn (Rao-Blackwell). A real value is taken to have the mixture of the normal distributions
-    that it was drawn from.
+    ladder of temperatures that exchange states (parallel tempering), because they leave modes that a plain chain
+    stays in. What is told of a value are averages, over the sweeps of that round, of its mean given all other
+    units: they vary less than counts of what was drawn (Rao-Blackwell). A real value has the mixture of the
+    normal distributions that it was drawn from.
 
     Attributes:
         n_chains: Of each row, >= 2; as many as draws, where more of these are asked for.

@@ -1,4 +1,4 @@
-"""Gibbs chains of many rows with what is observed clamped, at one temperature or several that exchange states."""
+"""Gibbs chains with what is observed clamped, of many rows, at one temperature or at several."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

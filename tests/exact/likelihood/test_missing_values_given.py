@@ -83,6 +83,15 @@ def test_chains_and_sums_give_the_probabilities_of_all_states(make: Any) -> None
         check(model, v, observed, find(MissingSums(), model, v, observed), EXACT)
 
 
+@pytest.mark.parametrize("name", ["mixed x bits", "spins x spins", "mixed", "DBM of categories", "bits x real"])
+def test_chains_on_ladders_of_temperatures_do_so_too(name: str) -> None:
+    """None of them agrees as closely as is asked for here, so that all go on with temperatures."""
+    model = MODELS[name]()
+    v, observed = rows_of(model)
+    way = MissingChains(n_chains=100, n_sweeps=30, most_sweeps=60, r_hat=1 + 1e-9, n_temperatures=3)
+    check(model, v, observed, find(way, model, v, observed), DRAWN)
+
+
 @pytest.mark.parametrize("make", OF_RELU.values(), ids=OF_RELU)
 def test_relu_units_are_integrated_out(make: Any) -> None:
     """Their integrals are those of a quadrature, because they have no list of states."""
