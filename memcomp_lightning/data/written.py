@@ -16,6 +16,9 @@ from memcomp_lightning.files import as_csv, written_whole
 ENDINGS = (".csv", ".csv.gz", ".tsv", ".parquet", ".npz", ".fasta")
 """Of the files that are written."""
 
+TABLES = tuple(ending for ending in ENDINGS if ending != ".fasta")
+"""Of those that hold columns of any kind."""
+
 SEQUENCE = "sequence"
 """The column that FASTA files are made of; another one, ``name``, gives the headers."""
 
@@ -71,7 +74,7 @@ def _text(columns: Columns, delimiter: str) -> str:
 
 def _cell(x: Any) -> Any:
     if isinstance(x, float):
-        return "" if x != x else f"{x:.7g}"
+        return "" if x != x else f"{x:.0f}" if x.is_integer() and abs(x) < 1e15 else f"{x:.7g}"
     return "" if x is None else x
 
 

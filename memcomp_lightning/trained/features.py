@@ -25,6 +25,7 @@ def transform(run: Run, rows: Rows, *, layer: int | None = None) -> Columns:
     Raises:
         UserError, SettingError: A value is missing; there is no such layer.
     """
+    run.require_pretrained()
     v, network = complete_values(run, rows), run.network
     n_layers = len(network) if isinstance(network, DBN) else 1
     if layer is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -26,6 +27,7 @@ class Run:
         network: What was pretrained: an RBM, a Boltzmann machine, a DBN or DBM.
         classifier: The fine-tuned network, which maps values of the visible units to logits; None without one.
         schema: What the visible units stand for; None of a weight file without its run folder.
+        pretrained: Whether ``network`` has trained weights; of a run without pretraining only the classifier has.
         settings: All settings of the run, as plain values; empty without the folder.
     """
 
@@ -34,6 +36,7 @@ class Run:
     classifier: nn.Module | None = None
     schema: Schema | None = None
     settings: Mapping[str, Any] | None = None
+    pretrained: bool = True
 
     @property
     def model(self) -> EnergyModel:
@@ -45,6 +48,7 @@ class Run:
         Raises:
             UserError: A DBN of several layers that were trained one after the other, or no energy model.
         """
+        self.require_pretrained()
         network = self.network
         if isinstance(network, DBN) and len(network) == 1:
             return cast(EnergyModel, network[0])
@@ -58,6 +62,14 @@ class Run:
         if not hasattr(network, "energy"):
             raise UserError(f"{self.path} is a {type(network).__name__}, which is no energy model.")
         return cast(EnergyModel, network)
+
+    def require_pretrained(self) -> None:
+        """Raise a UserError unless the network has trained weights."""
+        if not self.pretrained:
+            raise UserError(
+                f"{self.path} was not pretrained: it has a classifier alone, and no model of the data. Train with "
+                "pretrain.iterations=20, say."
+            )
 
     @property
     def trained_jointly(self) -> bool:
@@ -134,6 +146,8 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
         )
     schema, config = schema_of(content), cast(DictConfig, OmegaConf.load(written))
     for part in ("units", "model", "finetune"):
+        # Resolved, and for good: what an interpolation stands for is checked, too.
+        config[part] = OmegaConf.to_container(config[part], resolve=True)
         _check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
     n_replicas = _n_replicas(config)
     if n_replicas is None:
@@ -142,16 +156,17 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
         require_count("replica", replica, 0)
         require(replica < n_replicas, "replica", replica, f"an integer from 0 to {n_replicas - 1}")
     config.data.partitions, config.data.first_partitions, config.model.weights = 1, None, None
-    files = (
-        {name: folder.weights(name) for name in ("pretrain", "finetune")} if file is None else {file.stem: file}
-    )
-    require_choice("weight file", next(iter(files)), ("pretrain", "finetune"))
+    files = {name: folder.weights(name) for name in ("pretrain", "finetune")}
+    if file is not None:
+        require_choice("weight file", file.stem, tuple(files))
+    if file is not None and file.stem == "pretrain":
+        files = {"pretrain": file}
     there = {name: where for name, where in files.items() if where.is_file()}
     if not there:
         raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}")
     pairs, edges = read_checkpoint(next(iter(there.values()))).get("pairs"), config.model.get("connectivity")
-    if isinstance(pairs, Tensor) and isinstance(edges, DictConfig) and "path" in edges:
-        # The file may be elsewhere. It joins sites, and pairs are those of their entries.
+    if isinstance(pairs, Tensor) and isinstance(edges, DictConfig):
+        # Its file may be elsewhere, and pictures are not known here. It joins sites, pairs are of their entries.
         config.model.connectivity = _units_of(config, schema).site_of()[pairs].unique(dim=0).tolist()
     network, classifier = _network(config, schema), None
     if "pretrain" in there:
@@ -161,7 +176,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
         classifier = classifier_of(config, _network(config, schema), schema.n_classes).network.eval()
         _take(classifier, there["finetune"], n_replicas, replica)
     settings = cast(dict[str, Any], OmegaConf.to_container(config))
-    return Run(path, network.eval(), classifier, schema, settings)
+    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in there)
 
 
 _OWN = ("memcomp_lightning.", "torch.optim.")
@@ -172,7 +187,7 @@ def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -
     if isinstance(node, dict):
         target = node.get("_target_")
         allowed = (*_OWN, *(f"{package}." for package in trusted))
-        if target is not None and not str(target).startswith(allowed):
+        if target is not None and not (str(target).startswith(allowed) and _is_of(str(target), allowed)):
             package = str(target).partition(".")[0]
             raise UserError(
                 f"{path}: {name} is {target}, which is code of another package. If you trust it, in Python type "
@@ -182,6 +197,15 @@ def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -
         node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
     ):
         _check_targets(value, f"{name}.{key}", path, trusted)
+
+
+def _is_of(target: str, packages: tuple[str, ...]) -> bool:
+    """Whether a name is that of a class or function which one of the packages defines, not of what it imports."""
+    try:
+        found = resolve_name(target)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    return f"{getattr(found, '__module__', '')}.".startswith(packages)
 
 
 def _network(config: DictConfig, schema: Schema) -> nn.Module:

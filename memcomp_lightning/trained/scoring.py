@@ -160,7 +160,10 @@ def _classes(run: Run, rows: Rows, v: Tensor, whole: Tensor) -> tuple[Columns, f
     p = torch.full((len(v), len(names)), torch.nan)
     if bool(whole.any()):
         some = v[whole].to(next(run.classifier.parameters()))
-        p[whole] = torch.softmax(torch.cat([run.classifier(part) for part in some.split(4096)]).float(), dim=-1)
+        logits = torch.cat([run.classifier(part) for part in some.split(4096)]).float()
+        # By squared errors each class is learned by itself, and the outputs need not add up to one.
+        by_squares = (run.settings or {}).get("finetune", {}).get("loss") == "squared_error"
+        p[whole] = logits.sigmoid() if by_squares else torch.softmax(logits, dim=-1)
     best = p.argmax(-1)
     of_class = np.array([names[k] for k in best.tolist()], dtype=object)
     of_class[~whole.numpy()] = None

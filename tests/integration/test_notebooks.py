@@ -30,6 +30,9 @@ SHORTER = {
         '"finetune.batch_size=20"': '"figure.controls_at=[2]"',
     },
     "05_your_own_sampler": {"10, 3000": "10, 200"},
+    "06_a_table": {"iterations=300": "iterations=5"},
+    "07_sequences": {"iterations=60": "iterations=2", "range(2000)": "range(200)"},
+    "08_spins": {"iterations=40": "iterations=2", "2000, seed=1": "200, seed=1"},
 }
 """What stands in a notebook, once, and what takes its place."""
 

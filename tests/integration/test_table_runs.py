@@ -6,6 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import numpy
 import pytest
 import torch
 from running import QUIET, Outcome
@@ -112,6 +113,50 @@ def test_code_of_others_does_not_run(folder: Path, tmp_path: Path) -> None:
         memcomp_lightning.load(copy / "weights/pretrain.pt")
 
 
+@pytest.mark.parametrize(
+    "target", ["memcomp_lightning.runs.folder.os.getcwd", "memcomp_lightning.nothing", "torch.optim.sys.exit"]
+)
+def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target: str) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder / "labelled", copy)
+    settings = copy / "settings.yaml"
+    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Gaussian", target))
+    with pytest.raises(UserError, match="which is code of another package"):
+        memcomp_lightning.load(copy)
+
+
+def test_what_an_interpolation_stands_for_is_checked(folder: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder / "labelled", copy)
+    settings = copy / "settings.yaml"
+    text = settings.read_text().replace("model:\n", "model:\n  output_init: ${hidden_away}\n", 1)
+    before, _, after = text.partition("  output_init:\n")
+    after = after.partition("\n  weights:")[2]
+    settings.write_text(before + "  weights:" + after + "\nhidden_away:\n  _target_: os.getcwd\n")
+    with pytest.raises(UserError, match=r"model\.output_init is os\.getcwd, which is code of another package"):
+        memcomp_lightning.load(copy)
+
+
+def test_a_run_without_pretraining_has_no_model(folder: Path, command: Command) -> None:
+    settings = ["data=table", "data.path=people.csv", "data.columns={label: species, colour: ignore}", *QUICK]
+    found = command("train", *settings, "pretrain.iterations=0", "hydra.run.dir=alone", folder=folder)
+    assert found.status == 0, found.err
+    run = memcomp_lightning.load(folder / "alone")
+    assert run.classifier is not None
+    with pytest.raises(UserError, match="was not pretrained: it has a classifier alone"):
+        _ = run.model
+    found = command("transform", "alone", "people.csv", "output=none.csv", folder=folder)
+    assert "was not pretrained" in found.err
+
+
+def test_a_run_of_pictures_of_spins_is_loaded(folder: Path, command: Command) -> None:
+    numpy.save(folder / "spins.npy", numpy.random.default_rng(0).choice([-1, 1], (60, 9)))
+    settings = ["data=arrays", "data.path=spins.npy", "data.picture=[3,3]", "model=ising", "sampler=cd", *QUIET]
+    found = command("train", *settings, "pretrain.iterations=1", "hydra.run.dir=spins", folder=folder)
+    assert found.status == 0, found.err
+    assert len(memcomp_lightning.load(folder / "spins").network.pairs) == 12  # type: ignore[arg-type]
+
+
 def test_features(folder: Path, command: Command) -> None:
     found = command("transform", "labelled", "people.csv", "output=features.csv", folder=folder)
     assert found.status == 0, found.err
@@ -152,7 +197,7 @@ def test_paths_are_meant_from_where_they_were_typed(folder: Path, command: Comma
     ("settings", "message"),
     [
         (["data=table"], "data.path names no file: type data.path=FILE"),
-        (["data=table", "data.path=none.csv"], "data.path=none.csv: there is no such file"),
+        (["data=table", "data.path=none.csv"], "none.csv: there is no such file"),
         (["data=table", "data.path=people.csv", "units=spin"], "units = "),
         (["data=table", "data.path=people.csv", "data.paht=x"], "data.path"),
         (["data=digits", "units=columns"], "units = 'columns' is not allowed"),

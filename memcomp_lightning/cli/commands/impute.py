@@ -6,7 +6,7 @@ from pathlib import Path
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
-from memcomp_lightning.data.written import ENDINGS, check_output, write_columns
+from memcomp_lightning.data.written import ENDINGS, TABLES, check_output, write_columns
 from memcomp_lightning.errors import UserError, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
 from memcomp_lightning.plotting.written import check_figures, write_figures
@@ -67,8 +67,10 @@ def act(places: Sequence[str], settings: Settings) -> None:
         require_count("m", settings.m)
     outputs = _outputs(Path(settings.output), settings.m)
     gaps = None if settings.probabilities is None else Path(settings.probabilities)
-    for path in (*outputs, *([] if gaps is None else [gaps])):
+    for path in outputs:
         check_output(path, overwrite=settings.overwrite)
+    if gaps is not None:
+        check_output(gaps, overwrite=settings.overwrite, endings=TABLES)
     if gaps in outputs:
         raise UserError(f"probabilities={gaps}: the completed table goes there. Choose another file.")
     if settings.figures is not None:

@@ -8,7 +8,8 @@ import numpy as np
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
-from memcomp_lightning.data.written import check_output, write_columns
+from memcomp_lightning.data.written import TABLES, check_output, write_columns
+from memcomp_lightning.errors import UserError
 from memcomp_lightning.plotting import plot_likelihoods
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
@@ -53,7 +54,7 @@ USAGE = Usage(
 def act(places: Sequence[str], settings: Settings) -> None:
     """Score a file."""
     output = Path(settings.output)
-    check_output(output, overwrite=settings.overwrite)
+    check_output(output, overwrite=settings.overwrite, endings=TABLES)
     if settings.figures is not None:
         check_figures(Path(settings.figures), overwrite=settings.overwrite)
     annealing = Annealing(
@@ -62,6 +63,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
     run, table = load(places[0], replica=settings.replica), existing(places[1])
     rows = run.needed_schema.read(table, complete=False)
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
+    if settings.figures is not None and "log_likelihood" not in found.columns:
+        raise UserError(f"figures={settings.figures}: this run gives no log-likelihoods to draw. Leave it out.")
     write_columns(found.columns, output, overwrite=settings.overwrite)
     if settings.figures is not None:
         drawn = plot_likelihoods({"rows": found.columns["log_likelihood"]})

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out
-from memcomp_lightning.data.written import check_output, write_columns
+from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.trained import load
 from memcomp_lightning.trained.features import transform
 
@@ -40,7 +40,7 @@ USAGE = Usage(
 def act(places: Sequence[str], settings: Settings) -> None:
     """Transform a file."""
     output = Path(settings.output)
-    check_output(output, overwrite=settings.overwrite)
+    check_output(output, overwrite=settings.overwrite, endings=TABLES)
     run = load(places[0], replica=settings.replica)
     found = transform(run, run.needed_schema.read(Path(places[1]), complete=False), layer=settings.layer)
     write_columns(found, output, overwrite=settings.overwrite)

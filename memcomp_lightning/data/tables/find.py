@@ -134,7 +134,11 @@ def find(summaries: Sequence[Summary], given: Mapping[str, str], file: str, *, u
         UserError: A column does not exist, cannot be of its kind, has one value, or mixes numbers and texts.
     """
     by_name = {summary.name: summary for summary in summaries}
-    roles = {role: given[role] for role in ("label", "weight") if role in given and given[role] not in KINDS}
+    roles = {
+        role: given[role]
+        for role in ("label", "weight")
+        if role in given and given[role] not in (*KINDS, "ignore")
+    }
     for name in [*(name for name in given if name not in roles and name != "all"), *roles.values()]:
         if name not in by_name:
             known = ", ".join(list(by_name)[:20]) + (", ..." if len(by_name) > 20 else "")

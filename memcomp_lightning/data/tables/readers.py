@@ -41,7 +41,7 @@ def opened(path: Path, *, key: str | None = None) -> Opened:
         UserError: The file does not exist, is damaged, ends in the middle, or is of another kind.
     """
     if not path.is_file():
-        raise UserError(f"data.path={path}: there is no such file.")
+        raise UserError(f"{path}: there is no such file.")
     endings = [ending.lower() for ending in path.suffixes]
     ending = endings[-1] if endings else ""
     if ending in (".gz", ".bz2") and len(endings) > 1:
@@ -61,12 +61,18 @@ def opened(path: Path, *, key: str | None = None) -> Opened:
     if ending in (".npy", ".npz", ".h5", ".hdf5"):
         return _checked(_array(path, ending, key), path)
     known = ", ".join([*readers, ".npy", ".npz", ".h5", ".hdf5"])
-    raise UserError(f"data.path={path}: files that end in {ending!r} are not read; known are {known}.")
+    raise UserError(f"{path}: files that end in {ending!r} are not read; known are {known}.")
 
 
 def of_frame(frame: Any) -> Opened:
     """A DataFrame of pandas, or a table of Arrow."""
-    table = frame if isinstance(frame, pa.Table) else pa.Table.from_pandas(frame, preserve_index=False)
+    try:
+        table = frame if isinstance(frame, pa.Table) else pa.Table.from_pandas(frame, preserve_index=False)
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        reason = " ".join(str(part) for part in error.args)
+        raise UserError(
+            f"a column mixes kinds of values: {reason}. Make them all texts or all numbers."
+        ) from error
     table = table.rename_columns([str(name) for name in table.column_names])
     return Opened(iter(table.to_batches(max_chunksize=ROWS)), True)
 
@@ -203,7 +209,7 @@ def _chosen(names: list[str], key: str | None, path: Path) -> str:
     if key is None:
         key = next((name for name in names if len(names) == 1 or name.lower() == "x"), None)
     if key not in names:
-        raise UserError(f"{path} holds the arrays {', '.join(names)}: choose one by data.key=NAME.")
+        raise UserError(f"{path} holds the arrays {', '.join(names)}: choose one by data=arrays data.key=NAME.")
     return key
 
 

@@ -117,6 +117,8 @@ class TableSchema:
             UserError: A column is not there, or none of them is; a cell is not what its column can be.
         """
         names, n = set(batch.schema.names), batch.num_rows
+        if complete and self.weight is not None and self.weight not in names:
+            raise UserError(f"{file} has no column {self.weight!r}, the weights of the rows.")
         if not names & set(self.site_names):
             own, theirs = (", ".join(map(repr, some[:8])) for some in (self.site_names, batch.schema.names))
             raise UserError(f"{file} has none of the columns of the model, which are {own}; it has {theirs}.")

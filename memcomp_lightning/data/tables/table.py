@@ -12,7 +12,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.data.images import PixelLayout
-from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.tables.cells import CellError, Cells
 from memcomp_lightning.data.tables.find import Summary, find
 from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame, opened
@@ -63,7 +63,9 @@ class TableData:
         """The columns with their kinds, for people."""
         lines = [(column.name, column.kind, column.described) for column in self.schema.columns]
         if self.schema.label is not None:
-            lines.append((self.schema.label.name, "label", self.schema.label.described))
+            n_without = int((self.train.label == UNLABELLED).sum())
+            words = self.schema.label.described + (f"; {n_without:,} training rows have none" if n_without else "")
+            lines.append((self.schema.label.name, "label", words))
         if self.schema.weight is not None:
             lines.append((self.schema.weight, "weight", ""))
         lines += [(name, "ignored", reason) for name, reason in self.ignored.items()]
@@ -152,7 +154,7 @@ def table_data(
         picture: Height and width, where the columns are pixels.
         schema: What the columns are; None finds it out.
     """
-    further, given = further or {}, {"all": columns} if isinstance(columns, str) else dict(columns or {})
+    further, given = further or {}, _named(columns)
     summaries, n, named = _summaries(begin(), name, {column for column, kind in given.items() if kind == "ignore"})
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
@@ -208,7 +210,9 @@ def _besides(schema: TableSchema, names: list[str]) -> dict[str, str]:
 
 
 def _named(columns: Mapping[str, str] | str | None) -> dict[str, str]:
-    return {"all": columns} if isinstance(columns, str) else dict(columns or {})
+    if isinstance(columns, str):
+        return {"all": columns}
+    return {str(name): str(kind) for name, kind in (columns or {}).items()}
 
 
 def _beside(begin: Open, label: Any) -> Opened:
@@ -220,9 +224,10 @@ def _beside(begin: Open, label: Any) -> Opened:
         for batch in found.batches:
             part = label[first : first + batch.num_rows]
             first += batch.num_rows
-            if len(part) != batch.num_rows:
-                raise UserError(f"{len(label)} labels for more rows: expected one for each row.")
-            yield pa.record_batch([*batch.columns, pa.array(part)], names=[*batch.schema.names, LABEL])
+            if len(part) == batch.num_rows:
+                yield pa.record_batch([*batch.columns, pa.array(part)], names=[*batch.schema.names, LABEL])
+        if first != len(label):
+            raise UserError(f"{len(label)} labels for {first} rows: expected one for each row.")
 
     return Opened(batches(), found.named)
 

@@ -249,6 +249,27 @@ def test_an_array_with_labels_and_gaps() -> None:
     assert torch.bincount(labels + 1).tolist() == [10, 10, 20]
 
 
+def test_a_label_for_each_row() -> None:
+    for n in (39, 41):
+        with pytest.raises(UserError, match=f"{n} labels for 40 rows: expected one for each row"):
+            TableDataModule.from_array(
+                np.random.default_rng(0).normal(size=(40, 3)), [0, 1] * (n // 2) + [0] * (n % 2)
+            )
+
+
+def test_columns_that_are_called_like_roles_or_numbers(tmp_path: Path) -> None:
+    text = "weight,label,x\n" + "".join(f"{i * 0.7},{'ab'[i % 2]},{i % 3}\n" for i in range(30))
+    data = Table(path=written(tmp_path, text), columns={"weight": "ignore", "label": "category"}).load()
+    assert kinds(data.schema) == {"label": "category", "x": "category"}
+    array = np.random.default_rng(0).normal(size=(40, 3))
+    assert data_of(array, columns={2: "ignore"}).schema.n_sites == 2  # as YAML reads numbers
+
+
+def test_kinds_in_one_column_of_a_frame() -> None:
+    with pytest.raises(UserError, match="a column mixes kinds of values"):
+        data_of(pd.DataFrame({"x": [1, "a", 2.5, "b"] * 5, "y": range(20)}))
+
+
 def test_pictures_of_an_array(tmp_path: Path) -> None:
     np.save(tmp_path / "p.npy", np.random.default_rng(0).random((20, 4, 5)))
     data = Table(path=str(tmp_path / "p.npy"), columns="probability", picture=(4, 5)).load()
