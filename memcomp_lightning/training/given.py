@@ -26,7 +26,7 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
         units: The visible units, for categories and to check the shape; None takes tensors as they are.
 
     Raises:
-        SettingError: It is something else, or has other columns than the model.
+        SettingError: It is something else, or has columns or values that the model's units do not take.
 
     >>> as_batch(torch.zeros(3, 2)).label.tolist()
     [-1, -1, -1]
@@ -48,6 +48,7 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
             v = units.encode(v)
             observed = None if observed is None else units.over_sites(observed)
         require(v.shape[-1] == units.n, "columns of a batch", v.shape[-1], f"{units.n}, the visible units")
+        units.check(v, observed)
     label = parts[1] if len(parts) == 2 else torch.full(v.shape[:-1], UNKNOWN, dtype=torch.long, device=v.device)
     return Batch(v, label, share=1.0, closes_step=True, observed=observed)
 

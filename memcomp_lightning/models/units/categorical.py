@@ -241,7 +241,9 @@ class Categorical(Units):
 
     def beside(self, other: Units) -> "Categorical | None":
         """The sites of both."""
-        return Categorical([*self.sizes, *other.sizes]) if isinstance(other, Categorical) else None
+        if not isinstance(other, Categorical):
+            return None
+        return Categorical([*self.sizes, *other.sizes]).to(self._site.device)
 
 
 def _need_no_shift(field: Tensor) -> bool:

@@ -82,6 +82,21 @@ def test_anything_else_is_refused(given):
         as_batch(given)
 
 
+def test_values_that_the_units_do_not_take_are_refused():
+    with pytest.raises(SettingError, match=r"v in column 2, row 5 = 3\.0 is not allowed"):
+        [
+            *pretrain(
+                Greedy(RBM(6, 3)),
+                V.index_put((torch.tensor(5), torch.tensor(2)), torch.tensor(3.0)),
+                CD(k=1),
+                iterations=1,
+                optimizer=sgd,
+            )
+        ]
+    with pytest.raises(SettingError, match="is not allowed"):
+        as_batch(torch.tensor([[3.0, 0.0]]), Categorical([2, 3]))
+
+
 def test_other_columns_are_refused():
     with pytest.raises(SettingError, match="columns of a batch = 5 is not allowed: expected 6, the visible units"):
         [*pretrain(Greedy(RBM(6, 3)), V[:, :5], CD(k=1), iterations=1, optimizer=sgd)]
