@@ -108,6 +108,20 @@ class SequenceSchema:
         found[:] = ["".join(row) for row in signs]
         return {SEQUENCE: found}
 
+    def filled(self, path: Path, v: Tensor) -> dict[str, NDArray[Any]]:
+        """Completed sequences of a file with their names, or with the other columns of their table.
+
+        Args:
+            path: The file that v was read from.
+            v: Numbers of the letters, ``(n, n_sites)``.
+        """
+        file, found = read_sequences(path), self.decode(v)
+        if not file.is_table:
+            return {"name": np.array(file.names, dtype=object), **found}
+        from memcomp_lightning.data.tables.filled import columns_of  # Arrow is an extra
+
+        return {**columns_of(path), **found}
+
     def as_json(self) -> dict[str, Any]:
         """Plain values, from which :meth:`from_json` makes the schema again."""
         return {

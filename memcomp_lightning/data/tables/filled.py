@@ -50,6 +50,13 @@ def filled(path: Path, schema: TableSchema, v: Tensor) -> Columns:
     return columns | {name: own[name].write(numbers[:, at[name]]) for name in own if name not in columns}
 
 
+def columns_of(path: Path) -> Columns:
+    """All columns of a file as they are."""
+    batches = list(opened(path).batches)
+    names = batches[0].schema.names
+    return {name: np.concatenate([_plain(batch.column(name)) for batch in batches]) for name in names}
+
+
 def _plain(cells: Any) -> NDArray[Any]:
     """Cells as NumPy has them; of texts objects, None where there is none."""
     if pa.types.is_dictionary(cells.type):

@@ -111,6 +111,24 @@ def test_letters_that_are_not_known_are_missing(written):
     assert "'X' is no letter of dna" in refused(written(fasta(["ACXGT", "ACGGT"])))
 
 
+def test_completed_sequences_keep_their_names(written):
+    path = written(fasta(["AXN?M", "WYNKM"]))
+    schema = load(path).schema
+    v = schema.read(path, complete=False).v
+    v[0, [1, 3]] = torch.tensor([9.0, 20.0])
+    found = schema.filled(path, v)
+    assert list(found) == ["name", "sequence"]
+    assert found["name"].tolist() == ["s1", "s2"]
+    assert found["sequence"].tolist() == ["ALN-M", "WYNKM"]
+    table = written("id,sequence,note\n7,AXN?M,first\n8,WYNKM,\n", "family.csv")
+    found = schema.filled(table, v)
+    assert {name: column.tolist() for name, column in found.items()} == {
+        "id": ["7", "8"],
+        "sequence": ["ALN-M", "WYNKM"],
+        "note": ["first", ""],
+    }
+
+
 def test_a_row_without_a_known_letter_is_refused_but_where_gaps_are_filled(written):
     schema = SequenceSchema(3, "dna")
     path = written(fasta(["ACG", "NN?"]))
