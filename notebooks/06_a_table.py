@@ -82,7 +82,7 @@ plt.show()
 
 # %%
 kept = data.table.train
-filled = data.schema.decode(impute(run, kept).v)
+filled = data.schema.decode(impute(run, kept).completed(None))
 print({name: column[:3].tolist() for name, column in list(filled.items())[:4]})
 
 # %% [markdown]

@@ -115,10 +115,11 @@ def _identity(config: DictConfig, *, with_units: bool) -> Iterator[tuple[str, An
     for group in ("model", "units"):
         content = cast(dict[str, Any], OmegaConf.to_container(config[group], resolve=True))
         yield from ((f"{group}.{key!s}", value) for key, value in content.items() if key not in _INITIAL)
-    of_rows = ["partitions", "first_partitions", "columns", "test_fraction", "split_seed", "validation_fraction"]
-    if config.data.get("test") is None:
-        of_rows.append("path")  # of another file other rows would be split off: some were trained on
-    for name in of_rows:
+    # With another split, rows that were trained on would become test rows.
+    for name in (
+        *("partitions", "first_partitions", "columns"),
+        *("test_fraction", "split_seed", "validation_fraction"),
+    ):
         if name in config.data:
             value = config.data[name]
             yield f"data.{name}", OmegaConf.to_container(value) if OmegaConf.is_config(value) else value

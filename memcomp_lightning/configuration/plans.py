@@ -26,7 +26,7 @@ from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.values import check_values, require_held_out
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, RowsDataModule, TableDataModule
 from memcomp_lightning.data.schema import ImageSchema, Schema
-from memcomp_lightning.errors import SettingError, UserError, require, require_choice, require_count, require_parts
+from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.models import DBN, energy_models, start_at_means
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
@@ -360,8 +360,6 @@ def _data(config: DictConfig, stage: str, data: "Data", units: Units) -> RowsDat
         if isinstance(data, ImageData):
             return ImageDataModule(data, units=units, **settings)
         return TableDataModule(data, **settings)
-    except SettingError:
-        raise
     except ValueError as error:
         raise UserError(f"{stage}, data: {error}") from error
 
