@@ -46,7 +46,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
         return in_chunks(lambda rows: _of_visible_alone(wide, rows), v, model.n_units)
     sites = DiscreteSites.of(model.visible, like=v.double())
     real = torch.ones(model.n_visible, dtype=torch.bool, device=v.device)
-    real[model.visible.bits().at] = False
+    real[model.visible.bits().at.to(v.device)] = False
     site_of = model.visible.site_of().to(v.device)
     n_numbers = max(1, len(sites.at)) * max(model.n_hidden, model.n_visible)
 
