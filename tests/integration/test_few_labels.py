@@ -12,7 +12,7 @@ from running import FAST, QUIET, Outcome
 
 from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
-from memcomp_lightning.errors import SettingError
+from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.studies import AccuracyTrial
 from memcomp_lightning.studies.plan import Plan
@@ -128,7 +128,7 @@ def test_class_weights_reach_the_loss() -> None:
     ],
 )
 def test_what_is_out_of_range_is_refused(overrides: list[str], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises((SettingError, UserError), match=message):
         plan(*overrides)
 
 

@@ -670,9 +670,10 @@ def test_passes_of_the_page_take_the_same_steps(monkeypatch):
 
 def test_outdated_passes_of_our_own_fields_are_found():
     """Wherever they lie, a change of them makes the kernels on disk old."""
-    of_fields = {
-        part.py_func.__module__ for row in compiled_fields.FIELDS.values() for part in (row.start, row.advance)
-    }
+    rows = compiled_fields.FIELDS.values()
+    of_fields = {part.py_func.__module__ for row in rows for part in (row.start, row.advance)}
+    of_fields -= {"documentation"}  # of the page that another test has run
+    assert of_fields
     assert of_fields <= {module.__name__ for module in cpu._INLINED}
 
 
