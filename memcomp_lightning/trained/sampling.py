@@ -11,6 +11,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.errors import UserError, require, require_choice, require_count
+from memcomp_lightning.likelihood.layers import require_finite
 from memcomp_lightning.models import DBN, RBM, EnergyModel
 from memcomp_lightning.models.conditioned import conditioned, tempered
 from memcomp_lightning.models.units import Units
@@ -93,6 +94,7 @@ def sample(
     energy_model: EnergyModel = run.model if run is not None else _only_layer(network)
     require(energy_model.replicas == (), "replicas of the model", energy_model.replicas, "(): take one of them")
     reading = _Reading(run, energy_model.visible)
+    require_finite(energy_model)
     energy_model = energy_model if temperature == 1 else tempered(energy_model, 1 / temperature)
     if given is None:
         return Samples(*draw(Target(energy_model), n, kept=reading.kept, **settings))
@@ -164,6 +166,8 @@ def _completed(model: EnergyModel, rows: Rows, n: int, reading: _Reading, settin
 def _from_the_top(dbn: DBN, n: int, reading: _Reading, beta: float, settings: dict[str, Any]) -> Samples:
     """Samples of the top RBM, drawn down to the data."""
     require(dbn.replicas == (), "replicas of the network", dbn.replicas, "(): take one of them")
+    for rbm in dbn:
+        require_finite(rbm)
     top = dbn[len(dbn) - 1]
     x, mixing = draw(Target(top if beta == 1 else tempered(top, beta)), n, kept=lambda x: x, **settings)
     for rbm in reversed(list(dbn)[:-1]):

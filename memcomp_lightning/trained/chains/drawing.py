@@ -43,6 +43,9 @@ FEWEST_LADDERS = 16
 AT_ONCE = 4096
 """Chains of all temperatures that run side by side at most."""
 
+MOST_PARTS = 4
+"""Sweeps in which rows are drawn, at most, over those by which the chains are judged."""
+
 FORGOTTEN = 20
 """Autocorrelation times after which chains have forgotten their start."""
 
@@ -178,7 +181,7 @@ def _taken(
     n_draws = math.ceil(n / n_of_row)
     # Chains that do not mix come no further if one waits.
     wanted = spacing_of(known.autocorrelation) if known.mixed else BETWEEN
-    spacing = max(1, min(wanted, effort.most_sweeps // n_draws))
+    spacing = max(1, min(wanted, MOST_PARTS * effort.most_sweeps // n_draws))
     found, state = [], known.state
     for part in parts:
         if target.n_rows > 1:
