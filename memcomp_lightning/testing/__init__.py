@@ -10,8 +10,9 @@ from memcomp_lightning.testing.conformance import (
     visible_kinds,
 )
 from memcomp_lightning.testing.enumerated import Enumerated, enumerated, most_errors_off, sample_moments
+from memcomp_lightning.testing.small_models import small_dbn, small_layers, small_machines, small_rbms
 from memcomp_lightning.testing.statistics import chi_square_p_value, state_counts, visible_probabilities
-from memcomp_lightning.testing.units import check_units, small_dbn, small_layers, small_machines, small_rbms
+from memcomp_lightning.testing.units import check_units
 
 __all__ = [
     "Enumerated",

@@ -2,6 +2,8 @@
 
 Slow and obvious: nothing here asks a model for an energy, a mean or a cumulant. Everything follows from one
 function, :func:`log_sum`. Its derivatives by parameters are gradients of likelihoods; by biases they are means.
+So it is independent of the models' code, but knows the values of the package's own kinds of units alone. A kind of
+one's own is served by :mod:`~memcomp_lightning.testing.enumerated`, which asks the model for its energies.
 """
 
 import itertools

@@ -1,4 +1,8 @@
-"""All states of a small model, one by one: what faster sums are compared with."""
+"""All states of a small model, one by one: what faster sums are compared with.
+
+States are those of the units and energies those of ``model.energy``, so that kinds of one's own are served, too.
+Where the energy itself is in question, :mod:`~memcomp_lightning.testing.brute_force` has it from the parameters.
+"""
 
 from typing import NamedTuple
 

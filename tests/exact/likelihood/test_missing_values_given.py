@@ -23,8 +23,7 @@ from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
 from memcomp_lightning.models.observed import visible_units_coupled
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin
-from memcomp_lightning.testing import brute_force, enumerated, small_rbm
-from memcomp_lightning.testing.units import small_machines, small_rbms
+from memcomp_lightning.testing import brute_force, enumerated, small_machines, small_rbm, small_rbms
 
 MODELS = {**small_rbms(), **small_machines()}
 OF_RELU = {name: make for name, make in small_rbms().items() if name.endswith("ReLU")}

@@ -20,8 +20,7 @@ from memcomp_lightning.likelihood import log_partition_function
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.models.observed import visible_units_coupled
 from memcomp_lightning.models.units import Bernoulli, Spin
-from memcomp_lightning.testing import brute_force, small_rbm
-from memcomp_lightning.testing.units import small_machines
+from memcomp_lightning.testing import brute_force, small_machines, small_rbm
 from memcomp_lightning.trained import Run, partition
 from memcomp_lightning.trained.partition import Annealing, log_z_of
 from memcomp_lightning.trained.scoring import score
