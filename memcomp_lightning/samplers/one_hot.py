@@ -11,19 +11,13 @@ from memcomp_lightning.arrays import as_array
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.bit_form import BitForm, descend, read_bits
 from memcomp_lightning.models.units import side_by_side
-from memcomp_lightning.problems.constrained import Constrained, exactly
+from memcomp_lightning.problems.constrained import Constrained, Constraints, exactly
 from memcomp_lightning.problems.from_model import from_bit_form
 from memcomp_lightning.problems.maxsat import as_qubo
-from memcomp_lightning.problems.qubo import Qubo
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
 from memcomp_lightning.solvers.constrained import safe_penalty
+from memcomp_lightning.solvers.groups import N_GUIDES, shifted, table_of
 from memcomp_lightning.types import Configurations
-
-N_GUIDES = 64
-"""Descents from random states, from which the penalties are read."""
-
-MARGIN = 0.1
-"""What a penalty exceeds the largest gain by, as a share of the mean cost of a second state."""
 
 
 class Answers(NamedTuple):
@@ -44,20 +38,17 @@ class Answers(NamedTuple):
 
 @torch.no_grad()
 def minimise_in_groups(model: EnergyModel, form: BitForm, solver: QuboSolver, *, generator: Generator) -> Answers:
-    r"""Minimise a model's energy over bits of which exactly one in each group is 1.
+    """Minimise a model's energy over bits of which exactly one in each group is 1.
 
-    The energy :math:`t_g (\sum_{i \in g} y_i - 1)` of any number t is zero where the constraint of group g holds.
-    t is chosen, from states of low energy, halfway between the cost of a second bit and the gain by the one there
-    is: then a small penalty :math:`P_g (\sum y_i - 1)^2` suffices, and it hides the least of the objective.
-    The answers descend class by class in the model, which mends what is left; so do the states that the penalties
-    are read from, and the lowest of all counts. A minimum that the solver proves and that breaks a constraint is
-    sought again with penalties with which that never pays.
+    The solver is given small penalties (:mod:`~memcomp_lightning.solvers.groups`). Its answers descend class by
+    class in the model, which mends what is left; so do the states that the penalties are read from, and the lowest
+    of all counts. Where the solver proves a minimum that breaks a constraint, it is called again with penalties
+    with which that never pays.
     """
-    plain = from_bit_form(form)
-    guides = _descents(model, generator)
-    shift, penalties = _penalties(form, plain, bits_of(form, guides))
-    shifted = _shifted(plain, form, shift)
-    problem = Constrained.of(shifted, [exactly(1, group) for group in form.groups])
+    plain, guides = from_bit_form(form), _descents(model, generator)
+    constraints = Constraints.of(plain.n, [exactly(1, group) for group in form.groups])
+    objective, penalties = shifted(plain, table_of(constraints), bits_of(form, guides))
+    problem = Constrained(objective, constraints)
     solution = solver.minimise(as_qubo(problem.penalised(as_array(penalties))), generator=generator)
     broken = problem.n_broken(solution.assignments)
     proven = solution.status == int(Status.OPTIMAL)
@@ -97,27 +88,3 @@ def _descents(model: EnergyModel, generator: Generator) -> Configurations:
     layer = side_by_side(model.visible, model.hidden)
     x = layer.sample(model.b.new_zeros(*model.replicas, N_GUIDES, model.n_units), generator=generator)
     return descend(model, Configurations(x[..., : model.n_visible], x[..., model.n_visible :]))
-
-
-def _penalties(form: BitForm, qubo: Qubo, y: Tensor) -> tuple[Tensor, Tensor]:
-    """The number t and the penalty P of each group, ``(*replicas, n_groups)`` both, from states of low energy."""
-    widest = max(map(len, form.groups))
-    table = torch.tensor([[*group, *[-1] * (widest - len(group))] for group in form.groups], device=y.device)
-    # Energy of the bit at 1 less that at 0: of the one that is on, and of the cheapest other one.
-    cost, on = qubo.field(y)[..., table], y[..., table] > 0.5
-    absent = table < 0
-    there = torch.where(on & ~absent, cost, 0.0).sum(-1)
-    second = torch.where(on | absent, torch.inf, cost).amin(-1)
-    second = torch.where(second.isinf(), there, second)
-    shift = -(there + second).mean(-2) / 2
-    needed = torch.maximum(there + shift.unsqueeze(-2), -second - shift.unsqueeze(-2)).amax(-2).clamp(min=0)
-    apart = (second - there).abs().mean((-2, -1), keepdim=True).squeeze(-1)
-    return shift, needed + MARGIN * apart + torch.finfo(y.dtype).tiny
-
-
-def _shifted(qubo: Qubo, form: BitForm, shift: Tensor) -> Qubo:
-    """The problem with ``t (sum of the bits - 1)`` added for each group."""
-    sizes = torch.tensor([len(group) for group in form.groups], device=shift.device)
-    bits = torch.tensor([bit for group in form.groups for bit in group], device=shift.device)
-    linear = qubo.linear.index_add(-1, bits, shift.repeat_interleave(sizes, dim=-1))
-    return Qubo(qubo.graph, qubo.coupling, linear, qubo.offset - shift.sum(-1))

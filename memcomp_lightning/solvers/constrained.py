@@ -12,8 +12,10 @@ from memcomp_lightning.errors import require_count, require_parts
 from memcomp_lightning.problems.constrained import Constrained, sums_of
 from memcomp_lightning.problems.maxsat import as_qubo, to_qubo
 from memcomp_lightning.problems.qubo import Qubo
+from memcomp_lightning.problems.rows import Integers
 from memcomp_lightning.solvers.base import QuboSolution, QuboSolver, Status
 from memcomp_lightning.solvers.compiled import Numbers, limit_here
+from memcomp_lightning.solvers.groups import descend, groups_of, guides, shifted
 from memcomp_lightning.solvers.repair import repair
 
 if TYPE_CHECKING:
@@ -30,6 +32,8 @@ class PenaltyLoop:
     energy than the best without, these constraints cost too little: their penalties double, in the second half of
     the turns all penalties, and the next turn begins. Where none has after the first turn, but its best answer
     would gain less by breaking constraints (:func:`gains`), there is a second one with smaller penalties.
+    Where each constraint asks for exactly one of variables of its own, the first penalties are read from states of
+    low energy (:mod:`~memcomp_lightning.solvers.groups`), and answers descend by moves within the groups.
     Where no answer keeps all constraints, the last turn takes penalties with which breaking one never pays; so it
     does for a solver that proves its minima.
 
@@ -52,10 +56,12 @@ class PenaltyLoop:
         if it breaks something although that never pays, it is INFEASIBLE.
         """
         begin = time.perf_counter() - compiling.seconds_spent()
-        rows, penalties, safe = problem.constraints, local_penalties(problem), safe_penalty(problem)
+        groups = groups_of(problem)
+        posed, penalties = _posed(problem, groups, generator)
+        rows, safe = problem.constraints, safe_penalty(posed)
         found, lowest, limit = list[QuboSolution](), np.full(problem.objective.problems, np.inf), limit_here()
         for k in range(self.n_turns):
-            given = problem.penalised(as_array(penalties))
+            given = posed.penalised(as_array(penalties))
             if not getattr(self.solver, "takes_clauses", False):
                 given = as_qubo(given)
             try:
@@ -63,7 +69,7 @@ class PenaltyLoop:
                 raw = solution.assignments[..., : problem.n]
                 broken = rows.excess(rows.sums(to_numpy(raw) > 0.5)) > 0
                 hopeless = alike(np.any(broken & (penalties >= safe)[..., None, :], axis=-1), raw)
-                found.append(_mended(problem, solution, raw, hopeless))
+                found.append(_mended(problem, groups, solution, raw, hopeless))
             except KeyboardInterrupt:
                 if limit is None or not found:
                     raise
@@ -75,11 +81,11 @@ class PenaltyLoop:
             # Less energy than the best answer that keeps all constraints: to break some pays.
             pays = to_numpy(solution.energies) < lowest[..., None] - _LEAST * safe
             too_cheap = (broken & pays[..., None]).any(-2) & (penalties < safe)
-            enough = np.clip(gains(problem, found[-1].best), penalties / 4, penalties)
+            enough = np.clip(gains(posed, found[-1].best), penalties / 4, penalties)
             if too_cheap.any():
                 dearer = too_cheap | (k >= self.n_turns // 2)
                 penalties = np.where(dearer, np.minimum(2 * penalties, safe), penalties)
-            elif k == 0 and kept.all() and enough.sum() < 0.75 * penalties.sum():
+            elif k == 0 and groups is None and kept.all() and enough.sum() < 0.75 * penalties.sum():
                 penalties = enough
             else:
                 break
@@ -89,11 +95,23 @@ class PenaltyLoop:
         return QuboSolution.joined(found, time.perf_counter() - compiling.seconds_spent() - begin)
 
 
-def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: Array) -> QuboSolution:
+def _posed(problem: Constrained, groups: Integers | None, generator: "Generator") -> tuple[Constrained, Numbers]:
+    """The problem that the solver is given, and the first penalties, ``(*problems, n_constraints)``."""
+    if groups is None or not isinstance(problem.objective, Qubo):
+        return problem, local_penalties(problem)
+    qubo = problem.objective.floating()
+    objective, penalties = shifted(qubo, groups, guides(qubo, groups, generator))
+    return Constrained(objective, problem.constraints), to_numpy(penalties)
+
+
+def _mended(
+    problem: Constrained, groups: Integers | None, solution: QuboSolution, raw: Array, hopeless: Array
+) -> QuboSolution:
     """The answers of a turn, in the terms of the problem.
 
     Args:
         problem: The problem.
+        groups: Variables of which exactly one is 1, see :func:`groups_of`.
         solution: Answers of the solver.
         raw: Their states of the problem's variables, ``(*problems, n_restarts, n)``.
         hopeless: Whether they break a constraint although that never pays, ``(*problems, n_restarts)``.
@@ -104,6 +122,8 @@ def _mended(problem: Constrained, solution: QuboSolution, raw: Array, hopeless: 
     first = int(solution.energies.argmin()) if late else 0
     chosen = slice(first, first + 1 if late else None)
     x[..., chosen, :] = repair(problem, raw[..., chosen, :])
+    if groups is not None and isinstance(problem.objective, Qubo):
+        x[..., chosen, :] = descend(problem.objective, groups, x[..., chosen, :])
     broken = xp.where(was_run, problem.n_broken(x), len(problem.constraints))
     energies = xp.where(was_run, problem.energy(x), xp.inf)
     proven = solution.status == int(Status.OPTIMAL)

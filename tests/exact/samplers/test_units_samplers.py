@@ -150,10 +150,10 @@ def test_a_shift_and_penalties_change_no_energy_of_a_state():
     n = model.n_visible
     y = bits_of(form, Configurations(exact.x[:, :n], exact.x[:, n:]))
     plain = one_hot.from_bit_form(form)
-    shift, penalties = one_hot._penalties(form, plain, y[:50])
-    problem = one_hot.Constrained.of(
-        one_hot._shifted(plain, form, shift), [one_hot.exactly(1, group) for group in form.groups]
-    )
+    rows = one_hot.Constraints.of(plain.n, [one_hot.exactly(1, group) for group in form.groups])
+    objective, penalties = one_hot.shifted(plain, one_hot.table_of(rows), y[:50])
+    problem = one_hot.Constrained(objective, rows)
+    assert (objective.linear - plain.linear).abs().min() > 0.01
     torch.testing.assert_close(problem.penalised(penalties).energy(y), exact.energy, rtol=0, atol=1e-9)
     assert (penalties > 0).all()
 
