@@ -1,4 +1,5 @@
 import importlib
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,11 +14,14 @@ from memcomp_lightning.configuration.values import check_kinds
 from memcomp_lightning.errors import SettingError
 
 CONF = Path(__file__).parents[3] / "conf"
-OPTIONS = [
-    f"{group}={path.stem}"
+GROUPS = {
+    group: [f"{group}={path.stem}" for path in sorted((CONF / group).glob("*.yaml"))]
     for group in ("sampler", "solver", "positive", "pretrain", "model", "data", "units")
-    for path in sorted((CONF / group).glob("*.yaml"))
-]
+}
+SAMPLERS, *OTHERS = GROUPS.values()
+# Each option once, those of several groups side by side: to compose takes most of the time. Samplers set solvers.
+TOGETHER = [(option,) for option in SAMPLERS]
+TOGETHER += [tuple(filter(None, options)) for options in itertools.zip_longest(*OTHERS)]
 NUMBER_OR_WORD = {"sampler.beta"}
 
 
@@ -39,19 +43,21 @@ def numbers(settings: DictConfig, name: str = "") -> Iterator[str]:
             yield full_name
 
 
-@pytest.mark.parametrize("option", ["", *OPTIONS])
-def test_words_and_lists_in_place_of_every_number(option: str) -> None:
-    """Of an option, those that it brings; of none, all that there are."""
-    config = composed(*filter(None, [option]))
+@pytest.mark.parametrize("options", [(), *TOGETHER], ids=",".join)
+def test_words_and_lists_in_place_of_every_number(options: tuple[str, ...]) -> None:
+    """Of options, those that they bring; of none, all that there are."""
+    config = composed(*options)
     check_kinds(config)
     found = set(numbers(config)) - NUMBER_OR_WORD
     assert found
-    for name in (name for name in found if name.startswith(option.partition("=")[0])):
-        number = OmegaConf.select(config, name)
+    groups = {option.partition("=")[0] for option in options}
+    chosen = {name for name in found if not groups or name.partition(".")[0] in groups}
+    for name in chosen:
+        group, number = name.partition(".")[0], OmegaConf.select(config, name)
         for wrong, shown in (("oops", "'oops'"), ([1], "[1]"), (True, "True")):
             OmegaConf.update(config, name, wrong)
             with pytest.raises(SettingError, match=re.escape(f"{name} = {shown} is not allowed: expected")):
-                check_kinds(config)
+                check_kinds(*((config[group], group) if groups else (config,)))
         OmegaConf.update(config, name, number)
     check_kinds(config)
 

@@ -20,7 +20,7 @@ FAMILIES = {
     structured.vertex_cover: (60, 120),
     structured.colouring: (14, 30),
     structured.scheduling: (8, 4, 12),
-    structured.random_clauses: (30, 90, 60),
+    structured.random_clauses: (24, 60, 48),
     structured.potts: (12, 28),
     structured.k_of_n: (12, 4),
 }

@@ -29,8 +29,9 @@ def test_marks_at_the_ends_and_a_line_of_the_mean():
     assert axes.get_title(loc="left") == "two"
 
 
-@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
-@pytest.mark.parametrize("gap", [0.0, 1e-9, 3.0, -0.5])
+@pytest.mark.parametrize(
+    ("gap", "kind"), [(0.0, "png"), (1e-9, "png"), (3.0, "png"), (-0.5, "png"), (3.0, "svg"), (3.0, "pdf")]
+)
 def test_any_gap_is_drawn(tmp_path, kind, gap):
     plot_gaps({"best": [[(0.1, gap)]], "none": []}).savefig(tmp_path / f"gap.{kind}")
     assert (tmp_path / f"gap.{kind}").stat().st_size > 1000

@@ -53,7 +53,7 @@ def test_the_best_counts_what_descents_have_found():
 @pytest.mark.parametrize("patience", [None, 2])
 @pytest.mark.parametrize("every", [1, 7, 40])
 def test_the_best_ends_at_the_solvers_answer(kernel, patience, every):
-    qubo = Qubo.from_matrix(np.random.default_rng(0).normal(size=(40, 40)))
+    qubo = Qubo.from_matrix(np.random.default_rng(0).normal(size=(16, 16)))
     solver = DmmSolver(n_restarts=4, patience=patience, max_steps=40, record=Recording(every=every), kernel=kernel)
     solution = solver.minimise(qubo, generator=np.random.default_rng(1))
     (axes,) = plot_trajectory(solution.trajectory, last=4).axes
@@ -91,9 +91,16 @@ def test_restarts_that_were_not_run_are_left_out():
     assert machine.tolist() == [[2, 9], [4, 5], [6, 4], [7, 8], [8, 6]]
 
 
-@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
 @pytest.mark.parametrize(
-    "weight", [[[3.0, 3.0]] * 4, [[0.0]] * 4, [[1e12, 1e9]] * 4], ids=["flat", "zero", "large"]
+    ("weight", "kind"),
+    [
+        ([[3.0, 3.0]] * 4, "png"),
+        ([[0.0]] * 4, "png"),
+        ([[1e12, 1e9]] * 4, "png"),
+        ([[3.0, 3.0]] * 4, "svg"),
+        ([[3.0, 3.0]] * 4, "pdf"),
+    ],
+    ids=["flat", "zero", "large", "svg", "pdf"],
 )
 def test_any_range_is_drawn(tmp_path, weight, kind):
     plot_trajectory(trajectory_of(weight)).savefig(tmp_path / f"picture.{kind}")

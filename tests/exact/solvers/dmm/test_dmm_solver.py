@@ -373,7 +373,7 @@ def test_readings_follow_the_problem_unless_they_are_set(calls):
 @either_kernel
 @either_field
 @pytest.mark.parametrize(
-    "problem", [from_model(small_rbm(23, 19, replicas=(2,))), Qubo.from_matrix(normal(2, 29, 29))]
+    "problem", [from_model(small_rbm(23, 19, replicas=(2,))), Qubo.from_matrix(normal(2, 19, 19))]
 )
 def test_descents_never_make_the_answer_worse(problem, field, kernel):
     """Of restarts that do not stall: the one that descends more often may end first."""
@@ -597,7 +597,7 @@ def test_maxsat_problems_of_one_shape_are_solved_together(kernel):
             for block in one.longer
         ),
     )
-    solver = DmmSolver(n_restarts=12, patience=4, max_steps=211, record=Recording(every=20), kernel=kernel)
+    solver = DmmSolver(n_restarts=12, patience=4, max_steps=81, record=Recording(every=20), kernel=kernel)
     solution = solve(solver, many)
     states = binary_states(9, like=one.unit).expand(2, 3, -1, -1)
     torch.testing.assert_close(solution.best_energy, many.energy(states).amin(-1), rtol=1e-12, atol=1e-12)

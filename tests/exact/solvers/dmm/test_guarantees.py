@@ -182,7 +182,7 @@ def test_every_scheme_keeps_the_bounds(key, scheme):
         problem = with_axis(problem)
         machine = field.build(problem)
         state = field.init(machine, start(problem, field).voltage)
-        for step in range(8):
+        for step in range(5):
             state, dt, _ = integrator.step(field, machine, state)
             assert within(dt, integrator.dt_min, integrator.dt_max), f"{name}, step {step}"
             for part, x in zip(state._fields, state, strict=True):
@@ -193,28 +193,26 @@ def test_every_scheme_keeps_the_bounds(key, scheme):
 @pytest.mark.parametrize("kernel", [reference, cpu], ids=["reference", "compiled"])
 @pytest.mark.parametrize("key", FIELDS)
 def test_every_kernel_keeps_the_bounds(key, kernel):
-    """Voltages and long-term memories at the end of runs of several lengths, with noise."""
+    """Voltages and long-term memories at the end of runs with noise and descents."""
     field = FIELDS[key]
     for name, problem in (PROBLEMS | CLAUSES).items():
         if not suits(field, problem):
             continue
         problem = with_axis(problem)
-        for n_steps in (2, 11):
-            run = kernel.run(
-                field,
-                field.integrator,
-                problem,
-                start(problem, field),
-                n_steps=n_steps,
-                quench_every=4,
-                recording=Recording(every=1),
-            )
-            assert within(run.voltage, -1, 1), f"{name}, {n_steps} steps: voltage"
-            for memory in run.kept:
-                text = f"{name}, {n_steps} steps: long-term memory"
-                assert within(1 + memory, 1, field.long_term_max), text
-            assert bool(run.visited.time.isfinite().all()), f"{name}: time"
-            assert bool((run.visited.time.diff(dim=-1) > 0).all()), f"{name}: time"
+        run = kernel.run(
+            field,
+            field.integrator,
+            problem,
+            start(problem, field),
+            n_steps=7,
+            quench_every=4,
+            recording=Recording(every=1),
+        )
+        assert within(run.voltage, -1, 1), f"{name}: voltage"
+        for memory in run.kept:
+            assert within(1 + memory, 1, field.long_term_max), f"{name}: long-term memory"
+        assert bool(run.visited.time.isfinite().all()), f"{name}: time"
+        assert bool((run.visited.time.diff(dim=-1) > 0).all()), f"{name}: time"
 
 
 # --- energies ---------------------------------------------------------------------------------------------
@@ -266,13 +264,17 @@ def test_never_an_energy_below_the_minimum(key, quench_every, kernel):
             check(solver.minimise(problem, generator=rng.stream(0, "solver")), problem, name, MINIMA[name])
 
 
+HARDEST = ("huge", "zero", "one huge coupling", "huge fields", "wild 0", "layers of 1 and 4", "wild clauses")
+
+
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("key", ["clauses with noise", "bonds"])
 def test_never_an_energy_below_the_minimum_with_any_scheme(key, scheme):
     solver = DmmSolver(
         field=FIELDS[key], integrator=scheme(), n_restarts=3, max_steps=7, record=Recording(every=3)
     )
-    for name, problem in (PROBLEMS | CLAUSES).items():
+    for name in HARDEST:
+        problem = (PROBLEMS | CLAUSES)[name]
         if suits(FIELDS[key], problem):
             check(solver.minimise(problem, generator=rng.stream(0, "solver")), problem, name, MINIMA[name])
 
@@ -286,7 +288,7 @@ def test_random_problems_in_every_form(seed, key, kernel):
     scale = 10 ** float(60 * uniform(1, seed=seed + 10) - 30)
     matrix = normal(n, n, seed=seed + 20) * (uniform(n, n, seed=seed + 30) < uniform(1, seed=seed + 40)) * scale
     solver = DmmSolver(
-        field=FIELDS[key], n_restarts=20, max_steps=101, record=Recording(every=20), quench_every=2, kernel=kernel
+        field=FIELDS[key], n_restarts=20, max_steps=41, record=Recording(every=20), quench_every=2, kernel=kernel
     )
     qubo = Qubo.from_matrix(matrix)
     minimum, size = lowest(qubo), matrix.abs().sum().item()
