@@ -24,13 +24,13 @@ import matplotlib.pyplot as plt
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.plotting import plot_trajectory
 from memcomp_lightning.problems import from_model, from_qubo
 from memcomp_lightning.solvers import AlternatingDescent, BranchAndBound, Status
 from memcomp_lightning.solvers.dmm import ClauseField, DmmSolver, Recording
 
-rbm = RBM(32, 32, weight_init=Gaussian(std=0.5), generator=rng.stream(0, "weights"))
+rbm = RBM(32, 32, weight_init=Normal(std=0.5), generator=rng.stream(0, "weights"))
 with torch.no_grad():
     qubo = from_model(rbm)
 clauses = from_qubo(qubo)
@@ -104,7 +104,7 @@ shares = {"DMM": [], "descent": []}
 sizes = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0]
 for std in sizes:
     weights = rng.stream(1, "weights")
-    other = RBM(32, 32, weight_init=Gaussian(std=std), generator=weights)
+    other = RBM(32, 32, weight_init=Normal(std=std), generator=weights)
     with torch.no_grad():
         for bias in (other.b, other.c):
             bias.normal_(std=0.3, generator=weights)

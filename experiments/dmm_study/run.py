@@ -19,7 +19,7 @@ import matplotlib
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.solvers.dmm import (
     AdaptiveEuler,
@@ -43,7 +43,7 @@ N_RESTARTS = 28
 def random_rbms(n: int, *, cancel_mean: bool) -> Qubo:
     """Independent RBMs with N(0, 1) weights; ``cancel_mean`` sets b_j = -sum_i w_ij / 2 and c likewise."""
     generator = rng.stream(301, f"study {n} {cancel_mean}")
-    rbm = RBM(n, n, replicas=(N_INSTANCES,), weight_init=Gaussian(std=1.0), generator=generator)
+    rbm = RBM(n, n, replicas=(N_INSTANCES,), weight_init=Normal(std=1.0), generator=generator)
     with torch.no_grad():
         rbm.b.normal_(0, 0.5, generator=generator)
         rbm.c.normal_(0, 0.5, generator=generator)

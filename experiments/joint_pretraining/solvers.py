@@ -14,7 +14,7 @@ from dwave.samplers import SimulatedAnnealingSampler
 
 from memcomp_lightning import rng
 from memcomp_lightning.interop import annealer_graph
-from memcomp_lightning.models import DBM, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, BoltzmannMachine, Normal
 from memcomp_lightning.problems import Qubo, from_model
 from memcomp_lightning.samplers.ground_state import posed_as
 from memcomp_lightning.solvers import Portfolio, QuboSolver
@@ -24,12 +24,12 @@ STD = 0.3
 """Of couplings and biases: about where trained machines are."""
 
 MACHINES: dict[str, Callable[[torch.Generator], BoltzmannMachine]] = {
-    "DBM 32-32-32": lambda g: DBM(32, [32, 32], weight_init=Gaussian(std=STD), generator=g),
-    "DBM 784-500-500": lambda g: DBM(784, [500, 500], weight_init=Gaussian(std=STD), generator=g),
+    "DBM 32-32-32": lambda g: DBM(32, [32, 32], weight_init=Normal(std=STD), generator=g),
+    "DBM 784-500-500": lambda g: DBM(784, [500, 500], weight_init=Normal(std=STD), generator=g),
     "Zephyr 3, 336 units": lambda g: BoltzmannMachine(
-        32, None, annealer_graph("zephyr", 3, 32), weight_init=Gaussian(std=STD), generator=g
+        32, None, annealer_graph("zephyr", 3, 32), weight_init=Normal(std=STD), generator=g
     ),
-    "all pairs, 100 units": lambda g: BoltzmannMachine(50, 50, weight_init=Gaussian(std=STD), generator=g),
+    "all pairs, 100 units": lambda g: BoltzmannMachine(50, 50, weight_init=Normal(std=STD), generator=g),
 }
 
 

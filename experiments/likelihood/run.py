@@ -26,7 +26,7 @@ from memcomp_lightning.likelihood import (
     log_likelihood,
     log_partition_function,
 )
-from memcomp_lightning.models import DBN, RBM, Gaussian, Initialiser, Xavier
+from memcomp_lightning.models import DBN, RBM, Initialiser, Normal, Xavier
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import PCD
@@ -45,7 +45,7 @@ class Published(NamedTuple):
 
 PUBLISHED = {
     16: Published(50, Xavier(gain=4.0), shuffled=False),
-    500: Published(200, Gaussian(std=0.01), shuffled=True),
+    500: Published(200, Normal(std=0.01), shuffled=True),
 }
 
 
@@ -63,7 +63,7 @@ def start(rbm: RBM, images: ImageData, given: argparse.Namespace, *, centred: bo
 def trained(images: ImageData, given: argparse.Namespace, centring: Centring | None) -> tuple[RBM, float]:
     """An RBM after all passes of PCD-1, and the seconds."""
     published = PUBLISHED[given.hidden]
-    weights = published.weights if given.weight_std is None else Gaussian(std=given.weight_std)
+    weights = published.weights if given.weight_std is None else Normal(std=given.weight_std)
     dbn = DBN(784, [given.hidden], weight_init=weights, generator=rng.stream(given.seed, "weights"))
     start(dbn[0], images, given, centred=centring is not None)
     batches = Batches(

@@ -16,7 +16,7 @@ from torch.optim import SGD
 
 from memcomp_lightning.data import ImageData, ImageDataModule
 from memcomp_lightning.data.reduce import SIX_BY_SIX_WITHOUT_CORNERS
-from memcomp_lightning.models import DBN, Gaussian
+from memcomp_lightning.models import DBN, Normal
 from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.rng import stream, uniform
 from memcomp_lightning.training import MomentumSchedule, finetune
@@ -34,7 +34,7 @@ def images() -> ImageData:
 
 
 def classifier(n_replicas: int, iterations: int) -> DBNClassifier:
-    dbn = DBN(32, [32, 32], replicas=(n_replicas,), weight_init=Gaussian(std=0.1))
+    dbn = DBN(32, [32, 32], replicas=(n_replicas,), weight_init=Normal(std=0.1))
     return DBNClassifier(
         dbn, iterations=iterations, optimizer=partial(SGD, lr=0.1), schedules=[MomentumSchedule()]
     )

@@ -27,8 +27,9 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from torch import Tensor
 
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import require_count
 from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.models.machine import require_few_bits
 from memcomp_lightning.training import Score
 from memcomp_lightning.types import Configurations
 
@@ -143,7 +144,7 @@ def require_enumerable(callback: pl.Callback, module: pl.LightningModule, max_un
         n_units, name = model.n_enumerated, type(callback).__name__
         allowed = f"at most {max_units} units, because all their states are enumerated"
         remedy = f"Leave {name} out, or train a model with a smaller layer."
-        require(n_units <= max_units, f"units to enumerate for {name}", n_units, allowed, remedy)
+        require_few_bits(f"units to enumerate for {name}", n_units, max_units, allowed, remedy)
 
 
 class LastImages:

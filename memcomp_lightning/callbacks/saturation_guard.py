@@ -1,6 +1,7 @@
 """Stops training that has gone out of hand, with the last good weights on disk."""
 
 import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,8 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.callbacks.base import iteration_of, prefix_of
-from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.units import Spin
+from memcomp_lightning.errors import SettingError, require, require_count
+from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules.weights import write_tensors
 from memcomp_lightning.training import DivergedError, diverged_parameter
 from memcomp_lightning.types import Configurations
@@ -100,7 +101,10 @@ class SaturationGuard(pl.Callback):
         if positive is None or not positive.h.numel() or getattr(kind, "real", False):
             return 0.0
         h = _means(positive, outputs.get("v") if isinstance(outputs, dict) else None)
-        h = kind.to_intensity(h) if isinstance(kind, Spin) else h
+        with suppress(SettingError):  # a kind of one's own need not have a form in bits
+            if isinstance(kind, Units):
+                at, low, width = (part.to(h.device) for part in kind.bits()[:3])
+                h = (h[..., at] - low) / width
         share = (torch.minimum(h, 1 - h) <= AT_AN_END).float().mean((-1, -2)).max()
         return float(trainer.strategy.reduce(share, reduce_op="mean"))
 

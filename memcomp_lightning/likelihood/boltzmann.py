@@ -7,10 +7,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import require_count
 from memcomp_lightning.likelihood.layers import NUMBERS, in_chunks
 from memcomp_lightning.models.base import Block, EnergyModel, Images, PerReplica, PerState
-from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.machine import log2_states, require_few_bits
 from memcomp_lightning.models.mean_field import free_energy_of_means, hidden_blocks, mean_field
 from memcomp_lightning.models.units import Units, all_states
 
@@ -107,4 +107,4 @@ def _require_few(kind: Units, max_units: int) -> None:
     n_units = log2_states(kind)
     allowed = f"at most max_units = {max_units}, because all their states are enumerated"
     remedy = "Use Ais if the machine has two classes of units; otherwise use a smaller machine."
-    require(n_units <= max_units, "units outside the largest class", n_units, allowed, remedy)
+    require_few_bits("units outside the largest class", n_units, max_units, allowed, remedy)

@@ -19,7 +19,7 @@ from memcomp_lightning.likelihood.layers import NUMBERS, enumerable, in_chunks, 
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
 from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible
-from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.machine import log2_states, require_few_bits
 from memcomp_lightning.models.observed import check_mask, log_weight_of_hidden
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import all_states
@@ -95,7 +95,7 @@ def exact_samples(model: RBM, n: int, *, generator: Generator, max_units: int = 
 def _samples_by_cumulants(model: RBM, n: int, generator: Generator, max_units: int) -> Tensor:
     """Visible states by the free energies of all states of the smaller layer."""
     require_finite(model)
-    require(model.n_enumerated <= max_units, "units to enumerate", model.n_enumerated, f"at most {max_units}")
+    require_few_bits("units to enumerate", model.n_enumerated, max_units, f"at most {max_units}")
     wide, hidden_first = double_of(model), model.enumerates_hidden
     layer = model.hidden if hidden_first else model.visible
     rows = max(1, NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
@@ -154,7 +154,8 @@ def log_likelihood(
 def _log_sum_of_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> Tensor:
     """Log of the sum over missing values and hidden states."""
     n = log2_states(model.hidden)
-    require(n <= MOST_HIDDEN, "number of hidden units", n, f"at most {MOST_HIDDEN} where values are missing")
+    allowed = f"at most {MOST_HIDDEN} where values are missing"
+    require_few_bits("number of hidden units", n, MOST_HIDDEN, allowed)
     wide = double_of(model)
     states = all_states(model.hidden, wide.b.detach())
     states, observed = states.expand(*model.replicas, *states.shape), observed.expand(v.shape)

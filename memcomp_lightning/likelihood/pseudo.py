@@ -12,6 +12,7 @@ from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pu
 from memcomp_lightning.models.base import EnergyModel, Images
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.sites import DiscreteSites
+from memcomp_lightning.models.units import Units
 
 NODES_A_DEVIATION = 4
 """Nodes of the trapezoidal rule a standard deviation of a real unit, of which its error is far below rounding."""
@@ -45,8 +46,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
     if model.n_hidden == 0:
         return in_chunks(lambda rows: _of_visible_alone(wide, rows), v, model.n_units)
     sites = DiscreteSites.of(model.visible, like=v.double())
-    real = torch.ones(model.n_visible, dtype=torch.bool, device=v.device)
-    real[model.visible.bits().at.to(v.device)] = False
+    real = model.visible.real_entries().nonzero().flatten().tolist()
     site_of = model.visible.site_of().to(v.device)
     n_numbers = max(1, len(sites.at)) * max(model.n_hidden, model.n_visible)
 
@@ -58,7 +58,7 @@ def log_pseudo_likelihood(model: EnergyModel, v: Images) -> Float[Tensor, "*repl
         else:
             log_weight = lambda some: log_hidden_sum(wide, some, MOST_HIDDEN)  # noqa: E731
             found[..., sites.at] = _discrete(log_weight, rows, sites)
-        for entry in real.nonzero().flatten().tolist():
+        for entry in real:
             found[..., site_of[entry]] = _real(log_weight, wide, rows, entry, n_numbers)
         return found
 
@@ -143,12 +143,21 @@ def _real(log_weight: LogWeight, model: EnergyModel, rows: Tensor, entry: int, n
 
 def _reach(model: EnergyModel, entry: int) -> Tensor:
     """How far couplings may move the field of a unit from its bias, ``(*replicas,)``."""
+    largest = torch.cat([_largest_values(units) for units in (model.visible, model.hidden)]).to(model.b)
     for block in model.blocks():
         at = (block.units == entry).nonzero().flatten()
         if len(at):
-            size = block.weight[..., at[0], :].abs()
-            return size.sum(-1)  # bits, spins and states of categories are at most one
+            reach: Tensor = (block.weight[..., at[0], :].abs() * largest[block.neighbours]).sum(-1)
+            return reach
     raise AssertionError("every unit is in a class")
+
+
+def _largest_values(units: Units) -> Tensor:
+    """Largest absolute value of each discrete entry, ``(n,)``; zero of real ones, which couple to no real unit."""
+    form = units.bits()
+    return torch.zeros(units.n, device="cpu").index_copy(
+        0, form.at, form.low.abs().maximum((form.low + form.width).abs())
+    )
 
 
 def _of_visible_alone(model: EnergyModel, rows: Tensor) -> Tensor:
@@ -157,9 +166,9 @@ def _of_visible_alone(model: EnergyModel, rows: Tensor) -> Tensor:
     site_of = model.visible.site_of().to(rows.device)
     for block in model.blocks():
         field, x = block.field(rows), rows[..., block.units]
-        log_weight = field * x
-        if block.kind.curvature is not None:
-            log_weight = log_weight - 0.5 * block.kind.curvature.unsqueeze(-2) * x.square()
+        log_weight = block.kind.site_sums(field * x)
+        if not block.kind.linear:
+            log_weight = log_weight - block.kind.site_energies(x)
         sites = site_of[block.units].unique_consecutive()
-        found[..., sites] = block.kind.site_sums(log_weight) - block.kind.cumulant(field)
+        found[..., sites] = log_weight - block.kind.cumulant(field)
     return found

@@ -81,23 +81,18 @@ def _of_pairs(
     model: EnergyModel, form: QuadraticForm, at: Tensor, low: Tensor, width: Tensor
 ) -> tuple[QuadraticForm, Tensor]:
     """Of any model, by its matrix of couplings; only pairs that may be other than zero are kept."""
-    coupling, adjacent = _matrix(model, form)
     bias = form.bias
-    kept = torch.zeros(model.n_units, dtype=torch.bool, device=at.device)
-    kept[at] = True
-    real = (~kept).nonzero().flatten()
+    real = _real_entries(model).nonzero().flatten()
     constant = bias.new_zeros(model.replicas)
-    among = coupling[..., at[:, None], at]
-    linked = adjacent[at[:, None], at]
+    among, linked = _between(model, form, at, at)
     field = bias[..., at]
     if len(real):
         precision = _curvature(model)[..., real]
-        across, own = coupling[..., at[:, None], real], bias[..., real]
+        (across, touches), own = _between(model, form, at, real), bias[..., real]
         over = across / precision.unsqueeze(-2)
         among = among + over @ across.mT
         field = field + (over @ own.unsqueeze(-1)).squeeze(-1)
-        touches = adjacent[at[:, None], real].to(torch.float32)
-        linked = linked | (touches @ touches.mT > 0)
+        linked = linked | (touches.float() @ touches.float().mT > 0)
         constant = -0.5 * (own.square() / precision + torch.log(2 * math.pi / precision)).sum(-1)
     # E = constant - field.x - x'Ax / 2 with x = low + width y, and y^2 = y on the diagonal.
     pull = (among @ low.unsqueeze(-1)).squeeze(-1)
@@ -108,19 +103,34 @@ def _of_pairs(
     return QuadraticForm(pairs, among[..., first, second] * width[first] * width[second], of_bits), offset
 
 
-def _matrix(model: EnergyModel, form: QuadraticForm) -> tuple[Float[Tensor, "*replicas n n"], Tensor]:
-    """Symmetric couplings of all entries, and which of them there are."""
+def _between(
+    model: EnergyModel, form: QuadraticForm, rows: Tensor, columns: Tensor
+) -> tuple[Float[Tensor, "*replicas rows columns"], Tensor]:
+    """Couplings of some entries, visible ones first, to others, and which of them there are."""
     n, n_visible = model.n_units, model.n_visible
-    matrix = form.coupling.new_zeros(*model.replicas, n, n)
-    adjacent = torch.zeros(n, n, dtype=torch.bool, device=matrix.device)
+    matrix = form.coupling.new_zeros(*model.replicas, len(rows), len(columns))
+    adjacent = torch.zeros(len(rows), len(columns), dtype=torch.bool, device=matrix.device)
     if form.pairs is None:
-        matrix[..., n_visible:, :n_visible] = form.coupling
-        adjacent[n_visible:, :n_visible] = True
-    else:
-        first, second = form.pairs.unbind(-1)
-        matrix[..., first, second] = form.coupling
-        adjacent[first, second] = True
-    return matrix + matrix.mT, adjacent | adjacent.mT
+        v, w = (int((entries < n_visible).sum()) for entries in (rows, columns))
+        hidden_rows, hidden_columns = rows[v:] - n_visible, columns[w:] - n_visible
+        matrix[..., v:, :w] = form.coupling[..., hidden_rows, :][..., columns[:w]]
+        matrix[..., :v, w:] = form.coupling[..., hidden_columns, :][..., rows[:v]].mT
+        adjacent[v:, :w] = adjacent[:v, w:] = True
+        return matrix, adjacent
+    row_of, column_of = (_place_in(entries, n) for entries in (rows, columns))
+    for pairs in (form.pairs, form.pairs.flip(-1)):
+        first, second = row_of[pairs[:, 0]], column_of[pairs[:, 1]]
+        inside = (first >= 0) & (second >= 0)
+        matrix[..., first[inside], second[inside]] = form.coupling[..., inside]
+        adjacent[first[inside], second[inside]] = True
+    return matrix, adjacent
+
+
+def _place_in(entries: Tensor, n: int) -> Tensor:
+    """The place of each unit among some of them, ``(n,)``; -1 of the others."""
+    place = torch.full((n,), -1, device=entries.device)
+    place[entries] = torch.arange(len(entries), device=entries.device)
+    return place
 
 
 def _in_bits_already(model: EnergyModel) -> bool:
@@ -140,7 +150,7 @@ def read_bits(model: EnergyModel, form: BitForm, y: Shaped[Tensor, "*replicas n 
 
 @torch.no_grad()
 def at_real_means(model: EnergyModel, configurations: Configurations) -> Configurations:
-    """Configurations with real units at their means given the others."""
+    """Configurations with real units at their likeliest values given the others."""
     if not _has_real(model):
         return configurations
     x, n = torch.cat(configurations[:2], dim=-1), model.n_visible
@@ -187,6 +197,25 @@ def with_real_spread(model: EnergyModel, configurations: Configurations) -> Conf
     )
 
 
+@torch.no_grad()
+def integrated_energy(model: EnergyModel, configurations: Configurations) -> Float[Tensor, "*replicas n"]:
+    r"""``-\log \int e^{-E}`` over the real units, which are not coupled to each other; E where there are none.
+
+    It is what the form in bits has as its energy. Of normally distributed units it is E at their means less
+    ``log(2 pi / precision) / 2`` each.
+    """
+    x, n = torch.cat(configurations[:2], dim=-1), model.n_visible
+    if not _has_real(model):
+        return model.energy(x[..., :n], x[..., n:])
+    x = x.masked_fill(_real_entries(model), 0.0)
+    energy = model.energy(x[..., :n], x[..., n:])
+    for block in model.blocks():
+        if block.kind.real:
+            at = block.kind.site_of()[block.kind.real_entries()].to(x.device)
+            energy = energy - block.kind.cumulant(block.field(x))[..., at].sum(-1)
+    return energy
+
+
 def _has_real(model: EnergyModel) -> bool:
     return model.visible.real or model.hidden.real
 
@@ -203,19 +232,23 @@ def _curvature(model: EnergyModel) -> Float[Tensor, "*replicas n"]:
     )
 
 
+def _real_entries(model: EnergyModel) -> Tensor:
+    """Which units are real numbers, ``(n_units,)`` bool."""
+    return torch.cat([units.real_entries() for units in (model.visible, model.hidden)]).to(model.b.device)
+
+
 def _n_points(model: EnergyModel, x: Tensor) -> int:
     """Points that real units have at one state of the others."""
-    real = [block for block in model.blocks() if block.kind.curvature is not None]
+    real = [block for block in model.blocks() if block.kind.real]
     return math.lcm(*(len(block.kind.points(block.field(x[..., :1, :]))) for block in real))
 
 
 def _set_real(model: EnergyModel, x: Tensor, point: int | None = None) -> None:
     """Set the real units to their modes given the others, or to one of their points, in place."""
     for block in model.blocks():
-        curvature = block.kind.curvature
-        if curvature is not None:
+        if block.kind.real:
             field = block.field(x)
             points = [block.kind.mode(field)] if point is None else block.kind.points(field)
             values = points[(point or 0) % len(points)]
-            at = (curvature != 0).reshape(-1, curvature.shape[-1])[0]
+            at = block.kind.real_entries().to(x.device)
             x[..., block.units[at]] = values[..., at]

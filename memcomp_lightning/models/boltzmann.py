@@ -13,7 +13,7 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
-from memcomp_lightning.models.init import Gaussian, Initialiser
+from memcomp_lightning.models.init import Initialiser, Normal
 from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
 from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
@@ -124,7 +124,7 @@ class BoltzmannMachine(Machine):
         generator = stream(0, "weights") if generator is None else generator
         self.pairs: Tensor
         self.register_buffer("pairs", pairs)
-        draw = self._initial(n_units, replicas, weight_init or Gaussian(std=0.01), generator)
+        draw = self._initial(n_units, replicas, weight_init or Normal(std=0.01), generator)
         self.coupling = nn.Parameter(draw)
         self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(draw.new_zeros(*replicas, hidden.n))

@@ -151,8 +151,7 @@ def _values(units: Units, like: Tensor) -> tuple[Tensor, Tensor]:
     """The low value of each entry and what it gains; -1 and 2 where entries are taken as they are."""
     form = units.bits()
     low, width = like.new_full((units.n,), -1.0), like.new_full((units.n,), 2.0)
-    grouped = {bit for group in form.groups for bit in group}
-    alone = [bit for bit in range(len(form.at)) if bit not in grouped]
+    alone = form.lone()
     at = form.at[alone].to(like.device)
     low[at], width[at] = (part[alone].to(like) for part in (form.low, form.width))
     return low, width

@@ -23,7 +23,7 @@ class Initialiser(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Gaussian:
+class Normal:
     """N(0, std^2)."""
 
     std: float = 0.01
@@ -68,7 +68,7 @@ class Xavier:
 
 def initial(shape: tuple[int, ...], weight_init: Initialiser | None, generator: Generator | None) -> Tensor:
     """Initial weights, by default N(0, 0.01^2) from a fresh stream of seed 0."""
-    draw = Gaussian(std=0.01) if weight_init is None else weight_init
+    draw = Normal(std=0.01) if weight_init is None else weight_init
     return draw(shape, generator=stream(0, "weights") if generator is None else generator)
 
 

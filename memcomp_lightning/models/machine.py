@@ -179,6 +179,20 @@ def log2_states(units: Units) -> float:
     return int(bits) if bits == int(bits) else bits
 
 
+def require_few_bits(name: str, n: float, most: int, allowed: str, remedy: str = "") -> None:
+    """Raise a SettingError unless at most so many bits number the states that would be enumerated.
+
+    Args:
+        name: What is enumerated, as a number of units in {0, 1}.
+        n: See :func:`log2_states`.
+        most: How many are allowed.
+        allowed: The same in words.
+        remedy: What to do about it.
+    """
+    whole = isinstance(n, int)
+    require(n <= most, name if whole else f"{name}, in bits", n if whole else round(n, 1), allowed, remedy)
+
+
 def joined(parts: Sequence[Configurations]) -> Configurations:
     """Configurations one after the other, all with weights."""
     if len(parts) == 1:

@@ -17,6 +17,7 @@ def check_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
     for axis, name in ((-1, "row"), (-2, "column")):
         hidden = (~observed.any(axis)).nonzero()
         place = hidden[0].tolist()[-1] if len(hidden) else 0
+        place = int(model.visible.site_of()[place]) if name == "column" else place
         remedy = f"Leave out the {name}."
         require(not len(hidden), f"observed values in {name} {place}", 0, "one or more", remedy)
 
@@ -45,7 +46,7 @@ def visible_field(model: EnergyModel, h: Hidden) -> Visible:
         SettingError: Visible units are coupled to each other.
     """
     n, coupled = model.n_visible, visible_units_coupled(model)
-    remedy = "Use positive=clamped_gibbs, which draws what is missing."
+    remedy = "Draw them instead: positive=clamped_gibbs in training, likelihood.missing of a trained model."
     require(not coupled, "couplings between visible units", True, "none where missing values are summed", remedy)
     x = torch.cat((h.new_zeros(*h.shape[:-1], n), h), dim=-1)
     field = torch.empty_like(x)

@@ -36,8 +36,7 @@ class DiscreteSites(NamedTuple):
             SettingError: The units have no form in bits.
         """
         form = units.bits()
-        grouped = {bit for group in form.groups for bit in group}
-        sites = [*form.groups, *([bit] for bit in range(len(form.at)) if bit not in grouped)]
+        sites = [*form.groups, *([bit] for bit in form.lone())]
         n_groups, widest = len(form.groups), max(map(len, sites), default=1)
         n_states = max(widest, 2) if len(sites) > n_groups else widest
         at, of_low, of_width = form.at.cpu(), form.low.to(like).cpu(), form.width.to(like).cpu()
@@ -100,12 +99,10 @@ def sites_of(units: Units) -> list[Site]:
     """
     form = units.bits()
     at, low, width = form.at.tolist(), form.low.tolist(), form.width.tolist()
-    grouped = {bit for group in form.groups for bit in group}
     found = {
         at[group[0]]: Site([at[bit] for bit in group], [float(k) for k in range(len(group))])
         for group in form.groups
     }
-    found |= {at[k]: Site([at[k]], [low[k], low[k] + width[k]]) for k in range(len(at)) if k not in grouped}
-    discrete = set(at)
-    found |= {entry: Site([entry], None) for entry in range(units.n) if entry not in discrete}
+    found |= {at[k]: Site([at[k]], [low[k], low[k] + width[k]]) for k in form.lone()}
+    found |= {entry: Site([entry], None) for entry in units.real_entries().nonzero().flatten().tolist()}
     return [found[entry] for entry in sorted(found)]

@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.models.bit_form import descend, with_real_spread
+from memcomp_lightning.models.bit_form import descend, integrated_energy, with_real_spread
 from memcomp_lightning.models.units import Mixed, Units, side_by_side
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
@@ -21,7 +21,8 @@ class BlockAnnealing:
     Chains start at random states and draw each class of units given the others from :math:`e^{-\beta E}`, with
     inverse temperatures in equal ratios, and then descend. No units need a form in bits, and a categorical one is
     always in one state: with many states that is quicker than a solver with a penalty a site.
-    Real units have the variance :math:`1 / (\beta \gamma)` here, their measure being a part of E.
+    Real units have the variance :math:`1 / (\beta \gamma)` here, their measure being a part of E; that of discrete
+    kinds of one's own is taken as it is. ``ground_state_energy`` has real units integrated out, as a QUBO's has.
 
     Attributes:
         n_chains: Starts a replica, >= 1.
@@ -61,7 +62,8 @@ class BlockAnnealing:
         lowest, at = energies.min(-1)
         best = Configurations(*(part.take_along_dim(at[..., None, None], dim=-2) for part in found[:2]))
         reached = (energies <= (lowest + 1e-6 * lowest.abs()).unsqueeze(-1)).float().mean(-1)
-        info = {"ground_state_energy": lowest, "chains_at_best": reached}
+        energy = integrated_energy(model, best).squeeze(-1).double()
+        info = {"ground_state_energy": energy, "chains_at_best": reached}
         return NegativePhase(with_real_spread(model, best), state, info)
 
     def betas(self) -> list[float]:

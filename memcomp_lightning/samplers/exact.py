@@ -8,6 +8,7 @@ from torch import Generator
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.machine import require_few_bits
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
 
 
@@ -45,7 +46,7 @@ class Exact:
             "Use a smaller layer or another sampler (pcd, cd), or raise max_units (at most 20): each unit "
             "doubles time and memory."
         )
-        require(n <= self.max_units, "units to enumerate", n, allowed, remedy)
+        require_few_bits("units to enumerate", n, self.max_units, allowed, remedy)
         return NoState()
 
     @torch.no_grad()

@@ -66,9 +66,9 @@ class ModeAssisted:
 
     .. math:: g = \mathrm{clip}\left(\frac{\bar E - E(x^*)}{4 (n_{visible} + 1) (n_{hidden} + 1)}, 0, 1\right)
 
-    with the mean energy of all joint states :math:`\bar E`, that of units without fields: E(1/2, 1/2) for units
-    in {0, 1}. It is the depth of the ground state as a share of the largest for couplings of size one. In a
-    model of any connectivity the number of couplings and biases, plus one, stands for
+    with the mean energy of all joint states :math:`\bar E`, that of units without fields at their means: E(1/2,
+    1/2) for units in {0, 1}. It is the depth of the ground state as a share of the largest for couplings of size
+    one. In a model of any connectivity the number of couplings and biases, plus one, stands for
     :math:`(n_{visible} + 1) (n_{hidden} + 1)`, which it is for an RBM; a categorical unit counts once. The scaled
     update is written as a negative phase: x* has the weight g, the positive phase keeps 1 - g. One coin serves all
     replicas, so that a ground state is computed only when it is used. The coin is tossed and counted once a call:
@@ -135,8 +135,8 @@ def mode_scale(model: EnergyModel, mode: Configurations) -> Tensor:
     """
     layers = (model.visible, mode.v), (model.hidden, mode.h)
     free_v, free_h = (units.mean(torch.zeros_like(x[..., :1, :])) for units, x in layers)
-    energy = model.tempered_energy(*at_real_means(model, mode)[:2]).amin(-1)
-    depth = model.tempered_energy(free_v, free_h).squeeze(-1) - energy
+    energy = model.energy(*at_real_means(model, mode)[:2]).amin(-1)
+    depth = model.energy(free_v, free_h).squeeze(-1) - energy
     scale: Tensor = depth / (4 * _n_terms(model))
     return scale.clamp(0.0, 1.0)
 

@@ -9,12 +9,15 @@ from torch import Generator, Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.machine import log2_states, require_few_bits
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.sites import DiscreteSites
-from memcomp_lightning.models.units import all_states
 from memcomp_lightning.objective import shares
+from memcomp_lightning.samplers.positive.exact import with_all_hidden
 from memcomp_lightning.types import Configurations, NegativePhase, NoState
+
+MOST_NUMBERS = 2**27
+"""Values of units in the configurations of an update, where nobody says how many sites are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -39,7 +42,7 @@ class PseudoLikelihood:
 
     Attributes:
         n_sites: Sites a row that are drawn anew at each call, >= 1, of models with hidden units; the gradient is
-            then right in expectation. None takes all.
+            then right in expectation. None takes all, or as many as fit in about 512 MiB of configurations.
         max_units: Hidden units whose states are all summed at most, 1 to 16, where hidden units are coupled to
             each other: 2^max_units configurations for each one.
     """
@@ -68,7 +71,8 @@ class PseudoLikelihood:
         require(not model.visible.real, "kind of the visible units", kind, allowed, remedy)
         if _coupled_hidden_units(model):
             n, allowed = log2_states(model.hidden), f"at most max_units = {self.max_units} where they are coupled"
-            require(n <= self.max_units, "number of hidden units", n, allowed, "Use another sampler, say pcd.")
+            remedy = "Use another sampler, say pcd."
+            require_few_bits("number of hidden units", n, self.max_units, allowed, remedy)
         return NoState()
 
     @torch.no_grad()
@@ -88,7 +92,8 @@ class PseudoLikelihood:
         v, share = positive.v, shares(positive)
         sites = DiscreteSites.of(model.visible, like=v)
         n_all = len(sites.entries)
-        n_drawn = min(self.n_sites or n_all, n_all)
+        numbers_a_site = v[..., 0].numel() * sites.exists.shape[-1] * model.n_units
+        n_drawn = min(self.n_sites or max(1, MOST_NUMBERS // numbers_a_site), n_all)
         at = torch.arange(n_all, device=v.device).expand(*v.shape[:-1], n_all)
         if n_drawn < n_all:
             at = rng.uniform(at.shape, generator=generator, like=v).topk(n_drawn, dim=-1).indices
@@ -166,9 +171,5 @@ def _marginal(model: EnergyModel, v: Tensor) -> tuple[Tensor, list[Configuration
         return log_weight, [Configurations(v, h, weight) for h in points]
     if not _coupled_hidden_units(model):
         return -model.free_energy(v), [Configurations(v, model.hidden_mean(v), torch.ones_like(v[..., 0]))]
-    states = all_states(model.hidden, v)
-    wide = v.repeat_interleave(len(states), dim=-2)
-    h = states.repeat(v.shape[-2], 1).expand(*wide.shape[:-1], model.n_hidden)
-    log_joint = -model.energy(wide, h).double().unflatten(-1, (v.shape[-2], len(states)))
-    weight = torch.softmax(log_joint, dim=-1).flatten(-2).to(v.dtype)
-    return log_joint.logsumexp(-1), [Configurations(wide, h, weight)]
+    found, log_weight = with_all_hidden(model, v)
+    return log_weight, [found]

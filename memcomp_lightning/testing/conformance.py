@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, EnergyModel, Gaussian, units
+from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, EnergyModel, Normal, units
 from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.objective import contrast
@@ -36,7 +36,7 @@ def small_rbm(
     """A rectangular RBM with non-zero biases, so that a transpose or a sign shows; of any units."""
     visible, hidden = visible or units.Bernoulli(n_visible), hidden or units.Bernoulli(n_hidden)
     generator = rng.stream(seed, "test model")
-    init = Gaussian(std=std)
+    init = Normal(std=std)
     rbm = RBM(visible=visible, hidden=hidden, replicas=replicas, weight_init=init, generator=generator)
     return _with_biases(rbm, generator)
 
@@ -49,7 +49,7 @@ def small_dbm(*, replicas: tuple[int, ...] = (), visible: Units | None = None) -
         hidden_sizes=[3, 2],
         visible=visible,
         replicas=replicas,
-        weight_init=Gaussian(std=0.8),
+        weight_init=Normal(std=0.8),
         generator=generator,
     )
     return _with_biases(dbm, generator)
@@ -64,7 +64,7 @@ def small_machine(
     """
     generator = rng.stream(0, "test model")
     visible, hidden = visible or units.Bernoulli(4), hidden or units.Bernoulli(3)
-    pairs, init = full(visible.n_sites + hidden.n_sites)[1:], Gaussian(std=0.5)
+    pairs, init = full(visible.n_sites + hidden.n_sites)[1:], Normal(std=0.5)
     real = _real_sites(visible)
     pairs = pairs[~torch.isin(pairs, real).all(-1)]
     machine = BoltzmannMachine(

@@ -7,8 +7,7 @@ from typing import Any
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine
-from memcomp_lightning.models import Gaussian as Normal
+from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Normal
 from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, ReLU, Spin, Units
 

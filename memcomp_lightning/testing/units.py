@@ -288,6 +288,10 @@ def _check_measure(name: str, units: Units, field: Tensor) -> None:
     _check(energy.shape == x.shape[:-1], f"{name}: energy has shape {tuple(energy.shape)}")
     if units.linear:
         _check(_near(energy, 0.0), f"{name} says that its measure is constant, but energy is not 0")
+    else:
+        of_sites = units.site_energies(x)
+        _check(of_sites.shape == (len(x), units.n_sites), f"{name}: site_energies has another shape")
+        _check(_near(of_sites.sum(-1), energy), f"{name}: site_energies do not add up to energy")
     weight = rng.uniform(energy.shape, generator=rng.stream(3, "weights"), like=energy) - 0.5
     total = units.total_energy(x, weight)
     _check(_near(total, (weight * energy).sum(-1)), f"{name}: total_energy is not the weighted sum of energy")

@@ -111,8 +111,10 @@ def _groups(model: EnergyModel) -> Tensor:
         return (first.unsqueeze(-1) * visible.n_sites + second).flatten()
     site_of = torch.cat((_site_of(visible, model), _site_of(model.hidden, model) + visible.n_sites))
     first, second = site_of[form.pairs].unbind(-1)
-    pair = first * (visible.n_sites + model.hidden.n_sites) + second
-    number: Tensor = pair.unique(return_inverse=True)[1]
+    n_sites = visible.n_sites + model.hidden.n_sites
+    if n_sites == model.n_units:  # an entry a site: each coupling is its own group, and nothing is sorted
+        return torch.arange(len(first), device=first.device)
+    number: Tensor = (first * n_sites + second).unique(return_inverse=True)[1]
     return number
 
 

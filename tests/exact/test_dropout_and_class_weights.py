@@ -6,7 +6,7 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear, stacked
+from memcomp_lightning.models import DBN, BatchNormReluNetwork, Linear, Normal, stacked
 from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.training import (
     LOSSES,
@@ -23,11 +23,11 @@ WEIGHTS = torch.tensor([0.5, 1.0, 2.5], dtype=torch.float64)
 
 def network(kind="sigmoid", replicas=(), seed=0):
     generator = rng.stream(seed, "weights")
-    settings = {"replicas": replicas, "weight_init": Gaussian(std=1.0), "generator": generator}
+    settings = {"replicas": replicas, "weight_init": Normal(std=1.0), "generator": generator}
     if kind == "baseline":
         return BatchNormReluNetwork(7, [6, 5], 3, **settings).double()
     dbn = DBN(7, [6, 5], **settings)
-    init = Gaussian(std=1.0)
+    init = Normal(std=1.0)
     return DBNClassifier(dbn, n_classes=3, units=kind, output_init=init, generator=generator).network.double()
 
 

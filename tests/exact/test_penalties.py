@@ -7,15 +7,14 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import RBM, BoltzmannMachine
-from memcomp_lightning.models import Gaussian as GaussianWeights
+from memcomp_lightning.models import RBM, BoltzmannMachine, Normal
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin
 from memcomp_lightning.samplers import Exact, PseudoLikelihood, positive_phase
 from memcomp_lightning.training import L1, L2, EnergyStep, GroupSparsity
 from memcomp_lightning.training.step import StepState
 from memcomp_lightning.types import Configurations
 
-SETTINGS = {"weight_init": GaussianWeights(std=0.6), "replicas": (2,)}
+SETTINGS = {"weight_init": Normal(std=0.6), "replicas": (2,)}
 MODELS = {
     "RBM of bits": lambda: RBM(4, 3, **SETTINGS),
     "RBM of categories": lambda: RBM(visible=Categorical([2, 3, 1]), hidden=Categorical([2, 2]), **SETTINGS),
@@ -123,7 +122,7 @@ def test_machine_without_pairs_costs_nothing():
 
 def test_loss_of_chunks_is_that_of_the_update():
     """The penalty counts once, however many batches an update has; by itself each would count it anew."""
-    model = RBM(visible=Categorical([3, 2]), hidden=Spin(2), weight_init=GaussianWeights(std=0.6)).double()
+    model = RBM(visible=Categorical([3, 2]), hidden=Spin(2), weight_init=Normal(std=0.6)).double()
     v = model.visible.sample(torch.zeros(10, 5).double(), generator=rng.stream(0, "data"))
     step = EnergyStep(sampler=Exact(), penalties=[L1(0.3), GroupSparsity(0.1)])
     gradients = []
@@ -155,7 +154,7 @@ def test_l2_is_the_weight_decay_of_the_couplings():
 
 def planted(kind, pairs):
     """States with their counts in data of a machine of few couplings, and a machine of all pairs."""
-    truth = BoltzmannMachine(visible=kind, n_hidden=0, connectivity=pairs, weight_init=GaussianWeights(std=1.0))
+    truth = BoltzmannMachine(visible=kind, n_hidden=0, connectivity=pairs, weight_init=Normal(std=1.0))
     with torch.no_grad():
         truth.coupling.copy_(0.5 * truth.coupling.sign())
     states = truth.visible.states(torch.arange(truth.visible.n_states), like=truth.b)

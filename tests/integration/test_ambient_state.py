@@ -19,7 +19,7 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
     log_pseudo_likelihood,
 )
-from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Normal
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.modules import BaselineClassifier, Classifier, DBNClassifier, EnergyPretraining, StageModule
 from memcomp_lightning.objective import Centring, contrast
@@ -114,7 +114,7 @@ def sampled() -> list[torch.Tensor]:
 
 
 def models() -> list[Any]:
-    settings: dict[str, Any] = {"weight_init": Gaussian(std=0.5)}
+    settings: dict[str, Any] = {"weight_init": Normal(std=0.5)}
     return [
         RBM(5, 4, replicas=(2,), **settings),
         DBM(5, [3, 2], **settings),
@@ -143,8 +143,8 @@ def trained() -> list[torch.Tensor]:
     found: list[torch.Tensor] = []
     optimizer = partial(torch.optim.SGD, lr=0.5, momentum=0.5)
     settings: dict[str, Any] = {"iterations": 2, "optimizer": optimizer}
-    dbn = DBN(9, [5, 4], weight_init=Gaussian(std=0.5))
-    machine = BoltzmannMachine(9, 2, weight_init=Gaussian(std=0.5))
+    dbn = DBN(9, [5, 4], weight_init=Normal(std=0.5))
+    machine = BoltzmannMachine(9, 2, weight_init=Normal(std=0.5))
     modules: list[StageModule] = [
         EnergyPretraining(Greedy(dbn), PCD(n_chains=7), centring=Centring(rate=0.1), **settings),
         EnergyPretraining(Joint(dbn), CD(), **settings),

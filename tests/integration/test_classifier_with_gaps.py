@@ -12,7 +12,7 @@ from running import QUIET, Outcome
 from memcomp_lightning import rng
 from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
-from memcomp_lightning.models import DBN, RBM, Gaussian
+from memcomp_lightning.models import DBN, RBM, Normal
 from memcomp_lightning.modules import Classifier, DBNClassifier
 from memcomp_lightning.training import ClassWeighted, cross_entropy, evaluate, squared_error
 from memcomp_lightning.training.filling import N_DRAWS, Filling
@@ -36,7 +36,7 @@ def rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def model() -> RBM:
-    return RBM(4, 2, weight_init=Gaussian(std=2.0), generator=rng.stream(3, "weights"))
+    return RBM(4, 2, weight_init=Normal(std=2.0), generator=rng.stream(3, "weights"))
 
 
 def batch(n: int = 6) -> Batch:
@@ -46,7 +46,7 @@ def batch(n: int = 6) -> Batch:
 
 
 def network() -> torch.nn.Module:
-    init = Gaussian(std=2.0)
+    init = Normal(std=2.0)
     dbn = DBN(4, [3], weight_init=init, generator=rng.stream(4, "weights"))
     return DBNClassifier(dbn, n_classes=3, output_init=init, generator=rng.stream(5, "weights")).network.eval()
 

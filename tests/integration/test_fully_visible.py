@@ -20,7 +20,7 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
     log_pseudo_likelihood,
 )
-from memcomp_lightning.models import BoltzmannMachine, Gaussian
+from memcomp_lightning.models import BoltzmannMachine, Normal
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
@@ -57,8 +57,8 @@ SAMPLERS: dict[str, Any] = {
     ),
 }
 MACHINES: dict[str, Callable[..., BoltzmannMachine]] = {
-    "fully visible": partial(BoltzmannMachine, 9, 0, weight_init=Gaussian(std=0.3)),
-    "a grid": partial(BoltzmannMachine, 9, 0, grid(3, 3), weight_init=Gaussian(std=0.3)),
+    "fully visible": partial(BoltzmannMachine, 9, 0, weight_init=Normal(std=0.3)),
+    "a grid": partial(BoltzmannMachine, 9, 0, grid(3, 3), weight_init=Normal(std=0.3)),
     "a hidden unit without pairs": partial(BoltzmannMachine, 9, 2, [(unit, 9) for unit in range(9)]),
     "one hidden unit": partial(BoltzmannMachine, 9, 1),
 }

@@ -17,7 +17,7 @@ from memcomp_lightning.callbacks import GradientBias, LogLikelihood
 from memcomp_lightning.data import BarsAndStripes, ImageDataModule, ShiftingBars
 from memcomp_lightning.interop import annealer_graph
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
-from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Normal
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import (
@@ -60,7 +60,7 @@ def fit(module: pl.LightningModule, callbacks: list[pl.Callback], **settings: An
 @pytest.mark.parametrize("kind", ["DBM", "full"])
 def test_exact_phases_learn_the_data(kind: str, centring: Centring | None) -> None:
     """Bars and stripes, from the uniform distribution (3.6 nats) to close to the data."""
-    settings: dict[str, Any] = {"weight_init": Gaussian(std=0.1)}
+    settings: dict[str, Any] = {"weight_init": Normal(std=0.1)}
     model = DBM(9, [5, 3], **settings) if kind == "DBM" else BoltzmannMachine(9, 4, **settings)
     module = EnergyPretraining(
         Boltzmann(model, positive=ExactPosterior()),

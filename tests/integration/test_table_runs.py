@@ -106,7 +106,7 @@ def test_code_of_others_does_not_run(folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(folder / "labelled", copy)
     settings = copy / "settings.yaml"
-    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Gaussian", "os.system"))
+    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Normal", "os.system"))
     with pytest.raises(UserError, match=r"model\.\w+_init is os\.system, which is code of another package"):
         memcomp_lightning.load(copy)
     with pytest.raises(UserError, match="which is code of another package"):
@@ -120,7 +120,7 @@ def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target
     copy = tmp_path / "copy"
     shutil.copytree(folder / "labelled", copy)
     settings = copy / "settings.yaml"
-    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Gaussian", target))
+    settings.write_text(settings.read_text().replace("memcomp_lightning.models.Normal", target))
     with pytest.raises(UserError, match="which is code of another package"):
         memcomp_lightning.load(copy)
 

@@ -11,7 +11,7 @@ from running import FAST, Outcome
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, ShiftingBars
-from memcomp_lightning.models import DBN, Gaussian
+from memcomp_lightning.models import DBN, Normal
 from memcomp_lightning.modules import BaselineClassifier, DBNClassifier, EnergyPretraining, StageModule
 from memcomp_lightning.samplers import CD, PCD, Exact
 from memcomp_lightning.training import Greedy, MomentumSchedule, evaluate
@@ -53,7 +53,7 @@ def fit(module: StageModule, data: ImageDataModule, *callbacks: pl.Callback, **s
 def trained_dbn(
     sampler: Any = None, *, chunk_size: int = 10_000, batch_size: int | None = None, **settings: Any
 ) -> DBN:
-    dbn = DBN(7, [5, 3], weight_init=Gaussian(std=0.5))
+    dbn = DBN(7, [5, 3], weight_init=Normal(std=0.5))
     module = EnergyPretraining(
         Greedy(dbn), sampler or Exact(), iterations=4, centring=None, schedules=[MomentumSchedule()]
     )
@@ -93,7 +93,7 @@ def test_one_negative_phase_an_update_unless_it_starts_at_the_data(sampler: Any,
 
 
 def test_pretraining_one_layer_leaves_the_others_alone() -> None:
-    dbn = DBN(7, [5, 3], weight_init=Gaussian(std=0.5))
+    dbn = DBN(7, [5, 3], weight_init=Normal(std=0.5))
     before = [parameter.detach().clone() for parameter in dbn.parameters()]
     module = EnergyPretraining(Greedy(dbn), Exact(), iterations=4)
     fit(module, ImageDataModule(images(), batch_size=None), max_epochs=4)
@@ -103,7 +103,7 @@ def test_pretraining_one_layer_leaves_the_others_alone() -> None:
 
 def test_exact_pretraining_raises_the_likelihood_of_shifting_bars() -> None:
     data = ImageDataModule(ShiftingBars().load(), batch_size=None)
-    dbn = DBN(9, [5], weight_init=Gaussian(std=0.1))
+    dbn = DBN(9, [5], weight_init=Normal(std=0.1))
 
     before = mean_log_likelihood(dbn, data)
     fit(
@@ -119,7 +119,7 @@ def test_exact_pretraining_raises_the_likelihood_of_shifting_bars() -> None:
 )
 def test_any_optimizer_raises_the_likelihood(optimizer: type[torch.optim.Optimizer]) -> None:
     data = ImageDataModule(ShiftingBars().load(), batch_size=None)
-    dbn = DBN(9, [5], weight_init=Gaussian(std=0.1))
+    dbn = DBN(9, [5], weight_init=Normal(std=0.1))
     before = mean_log_likelihood(dbn, data)
     fit(EnergyPretraining(Greedy(dbn), Exact(), iterations=50, optimizer=partial(optimizer, lr=0.1)), data)
     assert mean_log_likelihood(dbn, data) > before + 0.1
@@ -154,7 +154,7 @@ def test_classifiers_learn(kind: str, partitions: int) -> None:
     optimizer = partial(torch.optim.Adam, lr=0.05)
     module: StageModule
     if kind == "dbn":
-        dbn = DBN(7, [11], replicas=data.replicas, weight_init=Gaussian(std=0.5))
+        dbn = DBN(7, [11], replicas=data.replicas, weight_init=Normal(std=0.5))
         module = DBNClassifier(dbn, n_classes=3, iterations=30, optimizer=optimizer)
     else:
         module = BaselineClassifier(
@@ -162,7 +162,7 @@ def test_classifiers_learn(kind: str, partitions: int) -> None:
             [11],
             n_classes=3,
             replicas=data.replicas,
-            weight_init=Gaussian(std=0.5),
+            weight_init=Normal(std=0.5),
             iterations=30,
             optimizer=optimizer,
         )
@@ -177,7 +177,7 @@ def test_classifiers_learn(kind: str, partitions: int) -> None:
 
 def test_replicas_learn_as_they_would_alone() -> None:
     data = ImageDataModule(images(), batch_size=None, partitions=2)
-    both = DBN(7, [5], replicas=(2,), weight_init=Gaussian(std=0.5))
+    both = DBN(7, [5], replicas=(2,), weight_init=Normal(std=0.5))
     alone = DBN(7, [5])
     alone.load_state_dict({name: tensor[1] for name, tensor in both.state_dict().items()})
     fit(EnergyPretraining(Greedy(both), Exact(), iterations=3), data)

@@ -13,7 +13,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.gradient_bias import gradient
 from memcomp_lightning.data import Digits, ImageDataModule, ShiftingBars
 from memcomp_lightning.likelihood import kl_divergence, log_likelihood, log_partition_function
-from memcomp_lightning.models import DBN, RBM, Gaussian
+from memcomp_lightning.models import DBN, RBM, Normal
 from memcomp_lightning.samplers import Exact, GroundState, ModeAssisted, ModeSchedule, positive_phase
 from memcomp_lightning.solvers import BruteForce
 from memcomp_lightning.studies import Record, Records
@@ -190,7 +190,7 @@ def test_likelihoods_are_chosen_by_held_out_images_and_bracketed(memcomp_train: 
 
 
 def test_mean_gradient_of_mode_assistance_weighs_both_sides() -> None:
-    rbm = RBM(n_visible=4, n_hidden=3, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "w"))
+    rbm = RBM(n_visible=4, n_hidden=3, replicas=(2,), weight_init=Normal(std=1.0), generator=rng.stream(0, "w"))
     exact, schedule = Exact(), ModeSchedule(n_updates=10)
     sampler = ModeAssisted(inner=exact, mode=GroundState(solver=BruteForce()), schedule=schedule)
     generator = rng.stream(0, "negative_phase")

@@ -63,12 +63,9 @@ def real_entries(units: Units) -> Int[Tensor, " n_real"]:
     Raises:
         SettingError: Units that are real in another way.
     """
-    curvature = units.curvature
-    if curvature is None:
-        name = type(units).__name__
-        require(not units.real, "visible units", name, "discrete units, or real ones with a precision")
-        return torch.zeros(0, dtype=torch.long, device="cpu")
-    return (curvature != 0).nonzero().flatten()
+    known = not units.real or units.curvature is not None
+    require(known, "visible units", type(units).__name__, "discrete units, or real ones with a precision")
+    return units.real_entries().nonzero().flatten()
 
 
 def width_of(units: Units, entry: int) -> float:

@@ -3,6 +3,7 @@
 import copy
 from abc import abstractmethod
 from collections.abc import Sequence
+from itertools import chain
 from typing import ClassVar, NamedTuple, Self
 
 import torch
@@ -31,6 +32,11 @@ class Bits(NamedTuple):
     low: Tensor
     width: Tensor
     groups: Sequence[Sequence[int]] = ()
+
+    def lone(self) -> list[int]:
+        """Bits that belong to no group."""
+        grouped = set(chain.from_iterable(self.groups))
+        return [bit for bit in range(len(self.at)) if bit not in grouped]
 
 
 class Units(nn.Module):
@@ -115,9 +121,13 @@ class Units(nn.Module):
         """Precision of each entry, ``(*replicas, n)``, where mu is ``exp(-curvature x^2 / 2)``, else None."""
         return None
 
+    def site_energies(self, x: Values) -> PerSite:
+        r"""``-log \mu`` of each site, where the kind is not ``linear``."""
+        raise self._without("energies of their own")
+
     def energy(self, x: Values) -> Float[Tensor, "*axes"]:
         r"""``-log \mu(x)``, the part of E that no field multiplies."""
-        return x.new_zeros(x.shape[:-1])
+        return x.new_zeros(x.shape[:-1]) if self.linear else self.site_energies(x).sum(-1)
 
     @torch.no_grad()
     def project(self) -> None:
@@ -134,7 +144,7 @@ class Units(nn.Module):
             v: Data.
             observed: Where they are known; None is everywhere.
             pure: Whether means, which stand for distributions over values, are refused as well.
-            column: Number of the first entry, for the error.
+            column: Number of the first site, for the error: a site is a column of the data.
         """
 
     def from_intensity(self, v: PerSite) -> Tensor:
@@ -145,12 +155,13 @@ class Units(nn.Module):
         """Grey values that data, or their means, stand for: an affine function, for pictures."""
         raise self._without("a reading of grey values")
 
-    def encode(self, kept: Tensor, *, check: bool = True) -> Values:
+    def encode(self, kept: Tensor, *, check: bool = True, column: int = 0) -> Values:
         """Entries of data as they are kept, one column a site: the same, but for categories.
 
         Args:
             kept: Data, ``(..., n_sites)``.
             check: Whether numbers that are no state are looked for and refused.
+            column: Number of the first site, for the error.
         """
         return kept
 
@@ -174,7 +185,7 @@ class Units(nn.Module):
     def start(self, mean: Values, variance: Values, *, column: int = 0) -> None:
         """Set the kind's own parameters from means and variances of the data, ``(*replicas, n)``.
 
-        ``column`` is the number of the first entry, for the error.
+        ``column`` is the number of the first site, for the error.
         """
 
     def states(self, numbers: Int[Tensor, "*axes"], *, like: Tensor) -> Float[Tensor, "*axes n"]:
@@ -196,6 +207,10 @@ class Units(nn.Module):
         """The site of each entry, ``(n,)`` int64, on the CPU."""
         return torch.arange(self.n, device="cpu")
 
+    def real_entries(self) -> Tensor:
+        """Which entries are real numbers, ``(n,)`` bool, on the CPU."""
+        return torch.full((self.n,), self.real, device="cpu")
+
     def over_sites(self, of_sites: Tensor) -> Tensor:
         """Give each entry what its site has: ``(..., n_sites)`` to ``(..., n)``."""
         return of_sites
@@ -209,8 +224,19 @@ class Units(nn.Module):
         return x
 
     def select(self, entries: Tensor) -> "Units":
-        """A layer of some entries, whole sites in rising order, with copies of the kind's own parameters."""
-        return type(self)(len(entries))
+        """A layer of some entries, whole sites in rising order, with copies of the kind's own settings.
+
+        Parameters and buffers with a number for each entry, ``(*replicas, n)``, keep those of these entries.
+        """
+        part = copy.deepcopy(self)
+        part.n = len(entries)
+        for name, parameter in list(part.named_parameters(recurse=False)):
+            if parameter.shape[-1:] == (self.n,):
+                setattr(part, name, nn.Parameter(parameter.detach()[..., entries], requires_grad=False))
+        for name, buffer in list(part.named_buffers(recurse=False)):
+            if buffer.shape[-1:] == (self.n,):
+                setattr(part, name, buffer[..., entries])
+        return part
 
     def beside(self, other: "Units") -> "Units | None":
         """One layer of this one and another after it, where that is of the same kind; else None."""
@@ -232,14 +258,29 @@ class Units(nn.Module):
 
 
 def require_values(
-    v: Values, allowed_at: Tensor, observed: Tensor | None, first_column: int, allowed: str, remedy: str = ""
+    v: Values,
+    allowed_at: Tensor,
+    observed: Tensor | None,
+    first_column: int,
+    allowed: str,
+    remedy: str = "",
+    site_of: Tensor | None = None,
 ) -> None:
-    """Raise a SettingError that names the first column with a value that is not allowed."""
+    """Raise a SettingError that names the first column with a value that is not allowed.
+
+    ``site_of`` has the column of each entry, counted from the first one; None is one each.
+    """
     wrong = ~allowed_at if observed is None else ~allowed_at & observed
     if bool(wrong.any()):
-        place = wrong.nonzero()[0].tolist()
-        value, column = float(v[tuple(place)]), first_column + place[-1]
-        require(False, f"v in column {column}, row {place[-2] if len(place) > 1 else 0}", value, allowed, remedy)
+        *rows, entry = place = wrong.nonzero()[0].tolist()
+        column = entry if site_of is None else int(site_of[entry])
+        require(False, f"v {at_place([*rows, column], first_column)}", float(v[tuple(place)]), allowed, remedy)
+
+
+def at_place(place: Sequence[int], first_column: int) -> str:
+    """Where a value of data stands, for errors: indices ``(*axes, row, column)``, or a column alone."""
+    row = f", row {place[-2]}" if len(place) > 1 else ""
+    return f"in column {first_column + place[-1]}{row}"
 
 
 def _with_axes(x: Tensor, replicas: tuple[int, ...]) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.units.base import Bits, PerSite, Units, Values, require_values
+from memcomp_lightning.models.units.base import Bits, PerSite, Units, Values, at_place, require_values
 
 _ENCODE = "Make entries of numbers of states by the units' encode."
 
@@ -134,23 +134,16 @@ class Categorical(Units):
 
     def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
         """Entries are in [0, 1] and add up to one in each site: between 0 and 1 they are probabilities."""
-        if pure:
-            require_values(
-                v, (v == 0) | (v == 1), observed, column, "entries in {0, 1} for categorical units", _ENCODE
-            )
-        else:
-            require_values(
-                v, (v >= 0) & (v <= 1), observed, column, "entries in [0, 1] for categorical units", _ENCODE
-            )
+        allowed_at, values = ((v == 0) | (v == 1), "{0, 1}") if pure else ((v >= 0) & (v <= 1), "[0, 1]")
+        allowed = f"entries in {values} for categorical units"
+        require_values(v, allowed_at, observed, column, allowed, _ENCODE, site_of=self._on_the_cpu)
         sums = self.site_sums(v)
         seen = None if observed is None else self._table(observed, False).any(-1)
         wrong = (sums - 1).abs() > 1e-3 if seen is None else ((sums - 1).abs() > 1e-3) & seen
         if bool(wrong.any()):
             place = wrong.nonzero()[0].tolist()
-            first = column + int(self._begin[place[-1]])
-            name = f"entries of the site at column {first}, row {place[-2]}, together"
-            allowed = "entries that add up to 1"
-            require(False, name, float(sums[tuple(place)]), allowed, _ENCODE)
+            name = f"entries together {at_place(place, column)}"
+            require(False, name, float(sums[tuple(place)]), "entries that add up to 1", _ENCODE)
 
     def bias_of(self, total: Values, n: float | Tensor) -> Values:
         """Log of the counts plus one, less its mean over the states of a site."""
@@ -170,7 +163,7 @@ class Categorical(Units):
         level = torch.arange(self.n, device=x.device) - self._begin[self._site]
         return self.site_sums(x * level / self.over_sites(self._last(x).clamp(min=1)))
 
-    def encode(self, states: Tensor, *, check: bool = True) -> Tensor:
+    def encode(self, states: Tensor, *, check: bool = True, column: int = 0) -> Tensor:
         """Entries of numbers of states, ``(..., n_sites)`` to ``(..., n)`` float32.
 
         Raises:
@@ -186,8 +179,7 @@ class Categorical(Units):
         if bool(wrong.any()):
             place = wrong.nonzero()[0].tolist()
             size = self.sizes[place[-1]]
-            row = f", row {place[-2]}" if len(place) > 1 else ""
-            name, allowed = f"state in column {place[-1]}{row}", f"an integer from 0 to q - 1 = {size - 1}"
+            name, allowed = f"state {at_place(place, column)}", f"an integer from 0 to q - 1 = {size - 1}"
             require(False, name, states[tuple(place)].item(), allowed)
         return self._one_hot(index, like)
 

@@ -90,9 +90,9 @@ class Gaussian(Units):
         """The precision."""
         return self.precision
 
-    def energy(self, x: Values) -> Tensor:
-        """Half of precision x^2, summed."""
-        return 0.5 * (x.square() * self._beside(self.precision, x)).sum(-1)
+    def site_energies(self, x: Values) -> PerSite:
+        """Half of precision x^2."""
+        return 0.5 * (x.square() * self._beside(self.precision, x))
 
     def total_energy(self, x: Values, weight: Tensor) -> Tensor:
         """By the sums of squares, so that its backward pass is one of a vector."""
@@ -149,13 +149,6 @@ class Gaussian(Units):
     def bits(self) -> Bits:
         """None: the units are integrated out."""
         return Bits(torch.arange(0, device="cpu"), torch.zeros(0, device="cpu"), torch.zeros(0, device="cpu"))
-
-    def select(self, entries: Tensor) -> "Gaussian":
-        """Some of the units, with copies of their precisions."""
-        part = Gaussian(len(entries), learned=False)
-        part.precision = self.precision.detach()[..., entries]
-        part.first_precision = self.first_precision[..., entries]
-        return part
 
 
 def _refuse_variance(value: float, column: int) -> None:

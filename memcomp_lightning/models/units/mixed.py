@@ -111,6 +111,16 @@ class Mixed(Units):
         ]
         return torch.cat(wide, dim=-1)
 
+    def site_energies(self, x: Values) -> PerSite:
+        """Of each part, zero where its measure is constant."""
+
+        def of_part(kind: Units, part: Tensor) -> Tensor:
+            if kind.linear:
+                return part.new_zeros(*part.shape[:-1], kind.n_sites)
+            return kind.site_energies(part)
+
+        return self._each(of_part, x)
+
     def energy(self, x: Values) -> Tensor:
         """The sum of the parts'."""
         energies = [kind.energy(part) for kind, part in zip(self.kinds, self._split(x), strict=True)]
@@ -131,12 +141,14 @@ class Mixed(Units):
         masks = [None] * len(self.kinds) if observed is None else self._split(observed)
         for kind, part, mask in zip(self.kinds, self._split(v), masks, strict=True):
             kind.check(part, mask, pure=pure, column=column)
-            column += kind.n
+            column += kind.n_sites
 
-    def encode(self, kept: Tensor, *, check: bool = True) -> Values:
+    def encode(self, kept: Tensor, *, check: bool = True, column: int = 0) -> Values:
         """Of each part."""
-        parts = kept.split([kind.n_sites for kind in self.kinds], dim=-1)
-        found = [kind.encode(part, check=check) for kind, part in zip(self.kinds, parts, strict=True)]
+        found = []
+        for kind, part in zip(self.kinds, kept.split([kind.n_sites for kind in self.kinds], dim=-1), strict=True):
+            found.append(kind.encode(part, check=check, column=column))
+            column += kind.n_sites
         return torch.cat(found, dim=-1)
 
     def decode(self, v: Values) -> Tensor:
@@ -157,7 +169,7 @@ class Mixed(Units):
         """Each part."""
         for kind, *parts in zip(self.kinds, self._split(mean), self._split(variance), strict=True):
             kind.start(*parts, column=column)
-            column += kind.n
+            column += kind.n_sites
 
     def states(self, numbers: Tensor, *, like: Tensor) -> Tensor:
         """Those of all parts, the first part counting slowest."""
@@ -191,6 +203,10 @@ class Mixed(Units):
             found.append(kind.site_of() + n)
             n += kind.n_sites
         return torch.cat(found)
+
+    def real_entries(self) -> Tensor:
+        """Those of the real parts."""
+        return torch.cat([kind.real_entries() for kind in self.kinds])
 
     def over_sites(self, of_sites: Tensor) -> Tensor:
         """Give each entry what its site has."""

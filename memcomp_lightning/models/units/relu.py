@@ -76,9 +76,9 @@ class ReLU(Units):
         above = above.square() / 2 + torch.special.log_ndtr(above) + 0.5 * math.log(2 * math.pi)
         return torch.where(field > 0, above, below)
 
-    def energy(self, x: Values) -> Tensor:
-        """Half of x^2, summed."""
-        return 0.5 * x.square().sum(-1)
+    def site_energies(self, x: Values) -> PerSite:
+        """Half of x^2."""
+        return 0.5 * x.square()
 
     def check(self, v: Values, observed: Tensor | None = None, *, pure: bool = False, column: int = 0) -> None:
         """Values are finite and >= 0."""

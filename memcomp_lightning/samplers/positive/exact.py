@@ -6,8 +6,8 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.models.machine import log2_states
+from memcomp_lightning.models.base import EnergyModel, PerState, Visible
+from memcomp_lightning.models.machine import log2_states, require_few_bits
 from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field
 from memcomp_lightning.models.units import all_states
 from memcomp_lightning.samplers.positive.base import PositivePhase
@@ -40,15 +40,11 @@ class ExactPosterior:
             SettingError: The model has more hidden units, or couples visible ones and values are missing.
         """
         n = log2_states(model.hidden)
-        require(n <= self.max_units, "number of hidden units", n, f"at most max_units = {self.max_units}")
-        states = all_states(model.hidden, v)
-        n_images, n_states = v.shape[-2], len(states)
-        wide = v.repeat_interleave(n_states, dim=-2)
-        h = states.repeat(n_images, 1).expand(*wide.shape[:-1], model.n_hidden)
+        require_few_bits("number of hidden units", n, self.max_units, f"at most max_units = {self.max_units}")
         if observed is None:
-            log_weight = -model.energy(wide, h).double().unflatten(-1, (n_images, n_states))
-            weight = torch.softmax(log_weight, dim=-1).flatten(-2).to(v.dtype)
-            return PositivePhase(Configurations(wide, h, weight), {})
+            return PositivePhase(with_all_hidden(model, v)[0], {})
+        states = all_states(model.hidden, v)
+        h = states.repeat(v.shape[-2], 1).expand(*v.shape[:-2], -1, -1)
         states = states.expand(*model.replicas, *states.shape)
         log_weight = log_weight_of_hidden(model, v, observed, states).double()
         weight, parts = torch.softmax(log_weight, dim=-1).to(v.dtype), []
@@ -61,3 +57,13 @@ class ExactPosterior:
         h = h.repeat_interleave(len(points), dim=-2)
         weight = (weight / len(points)).flatten(-2).repeat_interleave(len(points), dim=-1)
         return PositivePhase(Configurations(v, h, weight), {})
+
+
+def with_all_hidden(model: EnergyModel, v: Visible) -> tuple[Configurations, PerState]:
+    """Rows with each hidden state, those of a row side by side with weights p(h | v), and log of sum exp(-E)."""
+    states = all_states(model.hidden, v)
+    wide = v.repeat_interleave(len(states), dim=-2)
+    h = states.repeat(v.shape[-2], 1).expand(*wide.shape[:-1], model.n_hidden)
+    log_joint = -model.energy(wide, h).double().unflatten(-1, (v.shape[-2], len(states)))
+    weight = torch.softmax(log_joint, dim=-1).flatten(-2).to(v.dtype)
+    return Configurations(wide, h, weight), log_joint.logsumexp(-1)

@@ -22,8 +22,7 @@ from memcomp_lightning.interop import (
     write_rbms,
 )
 from memcomp_lightning.interop.rbms import Hyperparameters
-from memcomp_lightning.models import RBM
-from memcomp_lightning.models import Gaussian as Normal
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin, all_states
 
 N_VISIBLE, N_HIDDEN = 5, 3

@@ -16,7 +16,7 @@ from dwave.system.testing import MockDWaveSampler  # noqa: E402
 from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
 from memcomp_lightning.interop import QpuSampler  # noqa: E402
-from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
+from memcomp_lightning.models import RBM, Normal  # noqa: E402
 from memcomp_lightning.problems import Qubo, from_model, to_bqm  # noqa: E402
 from memcomp_lightning.samplers import AnnealerSamples, positive_phase  # noqa: E402
 from memcomp_lightning.solvers import BruteForce, DimodSolver  # noqa: E402
@@ -46,7 +46,7 @@ class Annealer(MockDWaveSampler):
 
 
 def rbm(n_visible=7, n_hidden=5, std=0.5):
-    return RBM(n_visible, n_hidden, weight_init=Gaussian(std=std), generator=rng.stream(0, "weights"))
+    return RBM(n_visible, n_hidden, weight_init=Normal(std=std), generator=rng.stream(0, "weights"))
 
 
 @pytest.mark.parametrize("faulty", ["avoid", "prune"])

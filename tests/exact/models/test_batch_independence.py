@@ -7,9 +7,9 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.likelihood import log_likelihood, log_likelihood_bound, log_pseudo_likelihood
-from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Gaussian, mean_field
+from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Normal, mean_field
 
-SETTINGS: dict[str, Any] = {"weight_init": Gaussian(std=1.5)}
+SETTINGS: dict[str, Any] = {"weight_init": Normal(std=1.5)}
 MACHINES: dict[str, Any] = {
     "DBM": DBM(5, [4, 4], **SETTINGS).double(),
     "all pairs": BoltzmannMachine(5, 6, **SETTINGS).double(),

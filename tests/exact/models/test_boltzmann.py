@@ -9,7 +9,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.interop import annealer_graph
-from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Gaussian, mean_field
+from memcomp_lightning.models import DBM, DBN, RBM, BoltzmannMachine, Normal, mean_field
 from memcomp_lightning.models.connectivity import colouring, from_graph, from_mask, from_pairs, full, grid, layered
 from memcomp_lightning.objective import Centring, contrast
 from memcomp_lightning.types import Configurations
@@ -18,7 +18,7 @@ from memcomp_lightning.types import Configurations
 def machine(n_visible=5, n_hidden=3, connectivity=None, replicas=(), std=0.8):
     generator = rng.stream(0, "weights")
     made = BoltzmannMachine(
-        n_visible, n_hidden, connectivity, replicas=replicas, weight_init=Gaussian(std=std), generator=generator
+        n_visible, n_hidden, connectivity, replicas=replicas, weight_init=Normal(std=std), generator=generator
     )
     return randomised(made)
 
@@ -70,7 +70,7 @@ def test_energy_is_that_of_the_dense_matrix(connectivity, replicas):
 
 
 def test_an_rbm_as_a_boltzmann_machine():
-    rbm = randomised(RBM(5, 3, replicas=(2,), weight_init=Gaussian(std=1.0)))
+    rbm = randomised(RBM(5, 3, replicas=(2,), weight_init=Normal(std=1.0)))
     same = BoltzmannMachine(5, 3, layered([5, 3]), replicas=(2,)).double()
     with torch.no_grad():
         same.coupling.copy_(rbm.weight.mT.flatten(-2))
@@ -93,8 +93,7 @@ def test_an_rbm_as_a_boltzmann_machine():
 
 def test_a_dbm_is_its_dbn_in_one_energy():
     dbm, dbn = (
-        kind(5, [3, 2, 4], weight_init=Gaussian(std=1.0), generator=rng.stream(7, "weights"))
-        for kind in (DBM, DBN)
+        kind(5, [3, 2, 4], weight_init=Normal(std=1.0), generator=rng.stream(7, "weights")) for kind in (DBM, DBN)
     )
     for weight, rbm in zip(dbm.weights(), dbn, strict=True):
         torch.testing.assert_close(weight, rbm.weight)

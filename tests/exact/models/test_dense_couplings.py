@@ -5,7 +5,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.models import RBM, BoltzmannMachine
-from memcomp_lightning.models.init import Gaussian
+from memcomp_lightning.models.init import Normal
 from memcomp_lightning.models.units import Bernoulli, Categorical, Spin, side_by_side
 
 KINDS = {
@@ -19,11 +19,11 @@ KINDS = {
 def machine_of(kind, replicas=(), connectivity=None):
     visible = KINDS[kind]()
     machine = BoltzmannMachine(
-        visible=visible, n_hidden=2, connectivity=connectivity, replicas=replicas, weight_init=Gaussian(std=1.0)
+        visible=visible, n_hidden=2, connectivity=connectivity, replicas=replicas, weight_init=Normal(std=1.0)
     ).double()
     with torch.no_grad():
         for bias in (machine.b, machine.c):
-            bias.copy_(Gaussian(std=1.0)(bias.shape, generator=rng.stream(0, "bias")))
+            bias.copy_(Normal(std=1.0)(bias.shape, generator=rng.stream(0, "bias")))
     return machine
 
 
@@ -69,7 +69,7 @@ def test_sums_of_energies_are_those_of_each_row(kind, replicas):
 
 @pytest.mark.parametrize("make", [lambda: machine_of("both", (2,)), lambda: machine_of("bits", (), ring()), "rbm"])
 def test_the_value_of_the_centred_energy_is_the_plain_one(make):
-    machine = RBM(4, 3, replicas=(2,), weight_init=Gaussian(std=1.0)).double() if make == "rbm" else make()
+    machine = RBM(4, 3, replicas=(2,), weight_init=Normal(std=1.0)).double() if make == "rbm" else make()
     v, h, weight = rows_of(machine)
     offsets = v.mean(-2) + 0.3, h.mean(-2) - 0.2
     value = machine.centred_total_energy(v, h, weight, *offsets)

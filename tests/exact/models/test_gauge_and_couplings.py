@@ -9,8 +9,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, contact_scores, couplings, zero_sum
-from memcomp_lightning.models import Gaussian as GaussianWeights
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, Normal, contact_scores, couplings, zero_sum
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin, all_states
 from memcomp_lightning.objective import Offsets, contrast
 from memcomp_lightning.samplers import Exact, PseudoLikelihood, positive_phase
@@ -30,7 +29,7 @@ HIDDEN = {"none": None, "bits": lambda: Bernoulli(2), "categories": lambda: Cate
 
 def made(visible, hidden=None, replicas=(2,), std=0.7):
     generator = rng.stream(0, "test model")
-    settings = {"replicas": replicas, "weight_init": GaussianWeights(std=std), "generator": generator}
+    settings = {"replicas": replicas, "weight_init": Normal(std=std), "generator": generator}
     model = (
         BoltzmannMachine(visible=visible, n_hidden=0, **settings)
         if hidden is None
@@ -86,7 +85,7 @@ def test_gauge_of_a_machine_with_hidden_units():
         visible=Categorical([2, 3]),
         hidden=Categorical([3]),
         connectivity=[(0, 1), (1, 2)],
-        weight_init=GaussianWeights(std=0.7),
+        weight_init=Normal(std=0.7),
     ).double()
     before = joint(model)
     torch.testing.assert_close(joint(model), before)
@@ -102,7 +101,7 @@ def test_gauge_of_a_machine_with_hidden_units():
 
 
 def test_gauge_beside_real_units():
-    model = RBM(visible=Mixed(Gaussian(2), Categorical([3])), hidden=Spin(2), weight_init=GaussianWeights(std=0.7))
+    model = RBM(visible=Mixed(Gaussian(2), Categorical([3])), hidden=Spin(2), weight_init=Normal(std=0.7))
     v = torch.cat((noise(6, 2, seed=0).float(), torch.eye(3).repeat(2, 1)), dim=-1)
     h = torch.tensor([[1.0, -1.0]]).repeat(6, 1)
     before = model.energy(v, h)

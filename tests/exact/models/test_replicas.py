@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, BatchNormReluNetwork, Gaussian, Linear, stacked
+from memcomp_lightning.models import DBN, BatchNormReluNetwork, Linear, Normal, stacked
 from memcomp_lightning.modules import DBNClassifier
 from memcomp_lightning.samplers import CD, PCD, Exact
 from memcomp_lightning.training import (
@@ -29,8 +29,8 @@ from memcomp_lightning.types import Batch
 
 def classifier(replicas, units="sigmoid", seed=0):
     generator = rng.stream(seed, "weights")
-    dbn = DBN(7, [5, 3], replicas=replicas, weight_init=Gaussian(std=1.0), generator=generator)
-    made = DBNClassifier(dbn, n_classes=11, units=units, output_init=Gaussian(std=1.0), generator=generator)
+    dbn = DBN(7, [5, 3], replicas=replicas, weight_init=Normal(std=1.0), generator=generator)
+    made = DBNClassifier(dbn, n_classes=11, units=units, output_init=Normal(std=1.0), generator=generator)
     return made.network.double()
 
 
@@ -46,7 +46,7 @@ def batch(replicas, n=13, share=0.7):
 def test_gradient_is_that_of_the_mean_loss(loss, kind, replicas):
     def network():
         if kind == "baseline":
-            made = BatchNormReluNetwork(7, [5, 3], 11, replicas=replicas, weight_init=Gaussian(std=1.0))
+            made = BatchNormReluNetwork(7, [5, 3], 11, replicas=replicas, weight_init=Normal(std=1.0))
             return made.double()
         return classifier(replicas, kind)
 

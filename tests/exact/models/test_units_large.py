@@ -4,11 +4,11 @@ import copy
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from memcomp_lightning import rng
 from memcomp_lightning.likelihood import log_likelihood, log_partition_function
-from memcomp_lightning.models import RBM, start_at_means
-from memcomp_lightning.models import Gaussian as Normal
+from memcomp_lightning.models import RBM, Normal, start_at_means
 from memcomp_lightning.models.units import Categorical, Gaussian, Mixed, ReLU, Spin
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, positive_phase
@@ -56,3 +56,26 @@ def test_ten_thousand_sites(visible, hidden):
             parameter -= 1e-3 * parameter.grad
     model.project()
     assert bool(model.free_energy(v).isfinite().all())
+
+
+class Largest(TorchDispatchMode):
+    """The most numbers that a tensor made in the meantime holds."""
+
+    numel = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        made = function(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor):
+            self.numel = max(self.numel, made.numel())
+        return made
+
+
+def test_the_form_in_bits_of_ten_thousand_real_units_needs_no_square_of_them():
+    """What is left are the couplings of five spins: W diag(1 / precision) W'."""
+    model = RBM(visible=Gaussian(N, variance=0.5), hidden=Spin(5), weight_init=Normal(std=0.05))
+    with Largest() as largest:
+        form = model.in_bits()
+    assert largest.numel <= model.weight.numel()
+    pairs, coupling, _ = form.form
+    expected = 4 * 0.5 * (model.weight @ model.weight.mT)
+    torch.testing.assert_close(coupling, expected[pairs[:, 0], pairs[:, 1]].detach())

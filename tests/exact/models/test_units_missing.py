@@ -253,7 +253,7 @@ def test_masks_that_hide_everything_or_half_a_site_are_refused():
 
 def test_observed_values_are_checked_and_missing_ones_are_not():
     model, v, mask = good()
-    for column, value, message in ((0, 7.0, "column 0, row 1 = 7"), (6, torch.nan, "column 6, row 1 = nan")):
+    for column, value, message in ((0, 7.0, "column 0, row 1 = 7"), (6, torch.nan, "column 3, row 1 = nan")):
         wrong = v.clone()
         wrong[1, column] = value
         with pytest.raises(SettingError, match=message):

@@ -386,22 +386,22 @@ REFUSED = {
     "two states at once": (
         Categorical([2, 3]),
         [[1, 0, 0, 1, 0], [1, 0, 0, 1, 1]],
-        r"entries of the site at column 2, row 1, together = 2\.0 .* add up to 1",
+        r"entries together in column 1, row 1 = 2\.0 .* add up to 1",
     ),
-    "no state": (Categorical([2, 3]), [[0, 0, 0, 1, 0]], r"site at column 0, row 0, together = 0\.0"),
-    "state as a number": (Categorical([2, 3]), [[0, 1, 2, 0, 0]], r"v in column 2, row 0 = 2\.0 .* encode"),
+    "no state": (Categorical([2, 3]), [[0, 0, 0, 1, 0]], r"entries together in column 0, row 0 = 0\.0"),
+    "state as a number": (Categorical([2, 3]), [[0, 1, 2, 0, 0]], r"v in column 1, row 0 = 2\.0 .* encode"),
     "infinite": (Gaussian(2), [[0.5, INF]], r"v in column 1, row 0 = inf .*finite values for Gaussian"),
     "missing": (Gaussian(2), [[0.5, 1.0], [NAN, 1.0]], r"v in column 0, row 1 = nan .*mask"),
     "negative": (ReLU(2), [[0.5, -1.0]], r"v in column 1, row 0 = -1\.0 .*>= 0 for ReLU"),
     "in the last part": (
         Mixed(Bernoulli(2), Categorical([3]), Spin(2)),
         [[0, 1, 0, 1, 0, 1, 5]],
-        r"column 6, row 0 = 5",
+        r"column 4, row 0 = 5",
     ),
     "in a part of categories": (
         Mixed(Bernoulli(2), Categorical([3])),
         [[0, 1, 0, 0, 0]],
-        r"at column 2, row 0, to",
+        r"together in column 2, row 0",
     ),
 }
 
@@ -426,6 +426,20 @@ def test_states_beyond_q_are_refused():
         Categorical([2, 3]).encode(torch.zeros(1, 3))
     states = torch.tensor([[1, 2], [0, 0]])
     assert Categorical([2, 3]).decode(Categorical([2, 3]).encode(states)).equal(states)
+
+
+def test_columns_are_sites_of_the_whole_table():
+    mixed = Mixed(Bernoulli(2), Categorical([3, 4]), Spin(1), Categorical([2]))
+    kept = torch.tensor([[0.0, 1, 2, 3, 1, 1], [1, 1, 0, 3, -1, 2]])
+    with pytest.raises(SettingError, match=r"state in column 5, row 1 = 2\.0 is not allowed: .* = 1"):
+        mixed.encode(kept)
+    v = mixed.encode(kept.clamp(max=torch.tensor([1.0, 1, 2, 3, 1, 1])))
+    mixed.check(v)
+    v[1, 9] = 3.0  # the spin
+    with pytest.raises(SettingError, match=r"v in column 4, row 1 = 3\.0"):
+        mixed.check(v)
+    with pytest.raises(SettingError, match=r"entries together in column 0 = 2\.0"):
+        Categorical([3]).check(torch.tensor([1.0, 1.0, 0.0]))  # a single row
 
 
 def test_variances_of_zero_and_constant_columns_are_refused():

@@ -8,8 +8,7 @@ import torch
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood import log_pseudo_likelihood
-from memcomp_lightning.models import DBM, RBM, BoltzmannMachine
-from memcomp_lightning.models import Gaussian as GaussianWeights
+from memcomp_lightning.models import DBM, RBM, BoltzmannMachine, Normal
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, ReLU, Spin, Units, all_states
 from memcomp_lightning.objective import Centring, Offsets, contrast, shares
 from memcomp_lightning.samplers import CD, PseudoLikelihood, positive_phase
@@ -17,7 +16,7 @@ from memcomp_lightning.training import EnergyStep
 from memcomp_lightning.training.step import StepState
 from memcomp_lightning.types import Configurations, NoState
 
-INIT = GaussianWeights(std=0.6)
+INIT = Normal(std=0.6)
 VISIBLE = {
     "bits": lambda: Bernoulli(5),
     "spins": lambda: Spin(5),
@@ -322,6 +321,17 @@ def test_real_units_are_refused(visible):
         PseudoLikelihood().init(model, 1, generator=rng.stream(0, "x"))
 
 
+def test_without_a_number_as_many_sites_are_drawn_as_fit_in_memory(monkeypatch):
+    """Seven sites of three states, four rows and 23 units: 276 numbers a site."""
+    model = RBM(visible=Categorical(7, q=3), hidden=Bernoulli(2), weight_init=INIT)
+    v = model.visible.sample(model.b.expand(4, -1), generator=rng.stream(0, "rows"))
+    for allowed, sites in ((2**27, 7), (276 * 5, 5), (1, 1)):
+        monkeypatch.setattr("memcomp_lightning.samplers.pseudo_likelihood.MOST_NUMBERS", allowed)
+        positive = positive_phase(model, v)
+        found = PseudoLikelihood().sample(model, NoState(), positive, generator=rng.stream(0, "x"))
+        assert found.configurations.v.shape[-2] == 4 + 4 * sites * 3
+
+
 def test_hidden_units_that_rise_from_zero_are_taken():
     model = RBM(visible=Spin(4), hidden=ReLU(2))
     v = draws(model).float()
@@ -333,6 +343,9 @@ def test_many_coupled_hidden_units_are_refused():
     model = DBM(5, [6, 3])
     with pytest.raises(SettingError, match=r"number of hidden units = 9.*at most max_units = 8"):
         PseudoLikelihood().init(model, 1, generator=rng.stream(0, "x"))
+    ragged = BoltzmannMachine(visible=Bernoulli(2), hidden=Categorical([3, 5, 7, 4]))
+    with pytest.raises(SettingError, match=r"number of hidden units, in bits = 8.7 is not allowed"):
+        PseudoLikelihood().init(ragged, 1, generator=rng.stream(0, "x"))
     PseudoLikelihood(max_units=9).init(model, 1, generator=rng.stream(0, "x"))
     PseudoLikelihood().init(RBM(5, 30), 1, generator=rng.stream(0, "x"))
 

@@ -101,8 +101,11 @@ def test_rectified_units_have_a_ground_state_by_blocks_alone():
     energy = model.energy(v, h)
     assert (h > 0).any()
     found = sample(BlockAnnealing(), model).configurations
-    torch.testing.assert_close(found.v[0], v[energy.argmin()])
-    torch.testing.assert_close(found.h[0], h[energy.argmin()])
+    best = v[energy.argmin()]
+    torch.testing.assert_close(found.v, best.expand(2, -1))
+    # Two points that have the mean of the hidden units there, and their variance.
+    torch.testing.assert_close(found.h.mean(0), model.hidden_mean(best.unsqueeze(0))[0])
+    assert (found.h[0] > found.h[1]).all()
 
 
 def test_without_the_factor_of_spins_without_constraints_or_integrals_another_state_is_found(monkeypatch):
@@ -158,6 +161,19 @@ def test_a_shift_and_penalties_change_no_energy_of_a_state():
     assert (penalties > 0).all()
 
 
+@pytest.mark.parametrize("name", ["mixed RBM", "real units", "mixed machine"])
+def test_both_samplers_of_ground_states_report_one_energy(name):
+    """That with real units integrated out: the quadratic form of the bits has it, and so have the blocks."""
+    model = MODELS[name]().double()
+    of_bits = sample(SAMPLERS["brute force"], model)
+    of_blocks = sample(BlockAnnealing(n_sweeps=30), model)
+    energy = of_bits.info["ground_state_energy"]
+    torch.testing.assert_close(of_blocks.info["ground_state_energy"], energy)
+    at_means = at_real_means(model, of_bits.configurations)
+    half_logs = 0.5 * (2 * torch.pi / model.visible.curvature[model.visible.real_entries()]).log().sum().detach()
+    torch.testing.assert_close(model.energy(*at_means[:2]).min() - half_logs, energy, check_dtype=False)
+
+
 def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
     model = MODELS["mixed RBM"]().double()
     mode = sample(SAMPLERS["brute force"], model).configurations
@@ -165,7 +181,7 @@ def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
     v, h = x.view(1, -1).split((model.n_visible, model.n_hidden), dim=-1)
     third = torch.tensor([1 / 3] * 3 + [1 / 4] * 4, dtype=torch.float64)
     free = torch.cat((torch.zeros(2), third, torch.zeros(2)))[None]
-    depth = model.tempered_energy(free, torch.full_like(h, 0.5)) - model.tempered_energy(v, h)
+    depth = model.energy(free, torch.full_like(h, 0.5)) - model.energy(v, h)
     expected = depth / (4 * (6 + 1) * (6 + 1))  # six visible sites
     torch.testing.assert_close(mode_scale(model, mode), expected.squeeze(), check_dtype=False)
     always = ModeSchedule(n_updates=1, p_max=1.0, delay=-1e3)

@@ -20,7 +20,7 @@ from memcomp_lightning import rng  # noqa: E402
 from memcomp_lightning.enumeration import binary_states  # noqa: E402
 from memcomp_lightning.errors import SettingError  # noqa: E402
 from memcomp_lightning.interop import MemcompSampler  # noqa: E402
-from memcomp_lightning.models import RBM, Gaussian  # noqa: E402
+from memcomp_lightning.models import RBM, Normal  # noqa: E402
 from memcomp_lightning.problems import Qubo, from_bqm, from_model, to_bqm  # noqa: E402
 from memcomp_lightning.samplers import AnnealerSamples, maximum_pseudo_likelihood_beta, positive_phase  # noqa: E402
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce, DimodSolver, Portfolio, Status  # noqa: E402
@@ -134,7 +134,7 @@ def test_annealers_keep_the_contract_of_a_sampler(make, beta):
 @pytest.mark.parametrize("beta", [0.3, 1.0, 2.5])
 def test_the_inverse_temperature_of_samples_is_found(beta):
     """Chains at a known temperature; a value off by a tenth would show."""
-    rbm = RBM(7, 5, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "weights"))
+    rbm = RBM(7, 5, replicas=(2,), weight_init=Normal(std=1.0), generator=rng.stream(0, "weights"))
     generator = rng.stream(0, "chains")
     chains = rbm.chains()
     v = chains.random(4001, generator=generator)

@@ -12,8 +12,7 @@ from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real, SpinColumn
 from memcomp_lightning.likelihood import exact_samples
-from memcomp_lightning.models import RBM
-from memcomp_lightning.models import Gaussian as Normal
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.units import Bernoulli
 from memcomp_lightning.trained import Run
 from memcomp_lightning.trained.gaps import SiteGaps

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import StageProgressBar
 from memcomp_lightning.data import PixelLayout
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, PCD, positive_phase
 from memcomp_lightning.training import Score
@@ -30,7 +30,7 @@ class TheirRBM(pl.LightningModule):
 
     def __init__(self) -> None:
         super().__init__()
-        self.model = RBM(6, 5, weight_init=Gaussian(std=0.3))
+        self.model = RBM(6, 5, weight_init=Normal(std=0.3))
         self.their_generator = rng.stream(1, "theirs")
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class TheirChains(TheirRBM):
 
     def __init__(self) -> None:
         super().__init__()
-        self.model = RBM(6, 5, replicas=(2,), weight_init=Gaussian(std=0.3))
+        self.model = RBM(6, 5, replicas=(2,), weight_init=Normal(std=0.3))
         self.chains = PCD(n_chains=4).init(self.model, 4, generator=self.their_generator)
 
     def training_step(self, batch: list[torch.Tensor], batch_idx: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from foreign import TheirChains, TheirRBM, fit
 from memcomp_lightning.callbacks import GradientBias
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import Exact, positive_phase
 from memcomp_lightning.types import NoState
@@ -88,7 +88,7 @@ def test_the_models_own_gradients_stay_as_they_are(tmp_path: Path) -> None:
 
 def test_layers_too_large_to_enumerate_are_refused_before_training(tmp_path: Path) -> None:
     module = TheirRBM()
-    module.model = RBM(17, 18, weight_init=Gaussian(std=0.3))
+    module.model = RBM(17, 18, weight_init=Normal(std=0.3))
     with pytest.raises(
         SettingError, match=r"units to enumerate for GradientBias = 17 .* at most 16 .*Leave GradientBias"
     ):

@@ -11,7 +11,7 @@ from memcomp_lightning.callbacks import LogLikelihood
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.metrics import MeanLogLikelihood, MeanLogPseudoLikelihood
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*does not have many workers.*")
 fits = pytest.mark.usefixtures("allow_global_rng")  # torch's DataLoader draws a base seed
@@ -76,7 +76,7 @@ def test_settings_out_of_range_are_refused() -> None:
 
 
 def test_metrics_add_up_over_batches_and_processes() -> None:
-    rbm = RBM(6, 5, replicas=(2,), weight_init=Gaussian(std=0.5))
+    rbm = RBM(6, 5, replicas=(2,), weight_init=Normal(std=0.5))
     v = rng.bernoulli(IMAGES.expand(2, -1, -1), generator=rng.stream(0, "bits"))
     with torch.no_grad():
         log_z = log_partition_function(rbm)

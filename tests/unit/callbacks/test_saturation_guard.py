@@ -14,10 +14,12 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from memcomp_lightning.callbacks import SaturationGuard
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN
+from memcomp_lightning.models import DBN, RBM
+from memcomp_lightning.models.units import Categorical, Mixed, Spin
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.training import DivergedError, Greedy
+from memcomp_lightning.types import Configurations
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*does not have many workers.*"),
@@ -76,6 +78,21 @@ def test_units_stuck_for_some_passes_stop_training_with_the_weights_from_before(
     with pytest.raises(DivergedError, match=said):
         fit(tmp_path, [SaturationGuard(patience=2)], module=module, n_passes=5)
     assert_holds(tmp_path / "last_good.pt", module.after[0])
+
+
+def test_spins_beside_categories_are_stuck_at_either_value(tmp_path: Path) -> None:
+    hidden = Mixed(Spin(2), Categorical([3]))
+
+    def stuck(field: list[float]) -> float:
+        module = GoesWrong(lambda rbm: None, at=0)
+        module.model = RBM(6, visible=None, hidden=hidden)
+        h = hidden.mean(torch.tensor([field]))
+        outputs = {"positive": Configurations(torch.zeros(1, 6), h)}
+        return SaturationGuard._stuck(pl.Trainer(logger=False, barebones=True), module, outputs)
+
+    assert stuck([-40.0, 40.0, 40.0, 0.0, 0.0]) == 1.0
+    assert stuck([0.0, 40.0, 40.0, 0.0, 0.0]) == pytest.approx(0.8)
+    assert stuck([0.0, 0.0, 0.0, 0.0, 0.0]) == 0.0
 
 
 def test_passes_before_an_interruption_count(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from memcomp_lightning.data.images import PixelLayout
 from memcomp_lightning.data.schema import ImageSchema
 from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real, SpinColumn
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.units import Bernoulli, Spin
 from memcomp_lightning.trained import Run
 from memcomp_lightning.trained.given import given_row
@@ -46,7 +46,7 @@ def use(tmp_path, monkeypatch):
 @pytest.fixture
 def table(use):
     generator = rng.stream(0, "test model")
-    rbm = RBM(visible=TABLE.units(), hidden=Bernoulli(5), weight_init=Gaussian(std=0.5), generator=generator)
+    rbm = RBM(visible=TABLE.units(), hidden=Bernoulli(5), weight_init=Normal(std=0.5), generator=generator)
     return use(TABLE, rbm)
 
 
@@ -146,7 +146,7 @@ def test_chains_that_do_not_mix_are_warned_of(use, capsys):
 
 
 def test_pictures_are_an_array_that_can_be_given_again(use):
-    model = RBM(visible=Spin(6), n_hidden=3, weight_init=Gaussian(std=0.5))
+    model = RBM(visible=Spin(6), n_hidden=3, weight_init=Normal(std=0.5))
     folder = use(PICTURES, model)
     command.main(["run", "n=40", "output=some.npz", "figure=some.png"])
     pictures = np.load(folder / "some.npz")["x"]

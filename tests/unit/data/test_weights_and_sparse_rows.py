@@ -7,7 +7,7 @@ from torch import nn
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches, SparseRows
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, Gaussian, Linear
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, Linear, Normal
 from memcomp_lightning.objective import contrast, weighted
 from memcomp_lightning.samplers import CD, ExactPosterior, MeanField, positive_phase
 from memcomp_lightning.training import LOSSES, ClassifierStep
@@ -80,7 +80,7 @@ def test_the_contrast_takes_a_weight_as_repeats(with_posterior):
     """One configuration an image, and several that carry weights of their own."""
     v, weight = images(3, 4), torch.tensor([1.0, 3.0, 2.0], dtype=torch.float64)
     repeated = v.repeat_interleave(weight.long(), dim=0)
-    model = DBN(4, [3], weight_init=Gaussian(std=1.0)).double()[0]
+    model = DBN(4, [3], weight_init=Normal(std=1.0)).double()[0]
     nothing = Configurations(torch.zeros(1, 4).double(), torch.zeros(1, 3).double())
 
     def phase(of):
@@ -111,7 +111,7 @@ def test_a_reconstruction_weighs_what_its_image_does():
 def test_the_loss_takes_a_weight_as_repeats(closed_form, loss):
     v, label = images(3, 4), torch.tensor([0, 2, 1])
     weight = torch.tensor([1.0, 3.0, 2.0], dtype=torch.float64)
-    hidden = DBN(4, [5], weight_init=Gaussian(std=1.0)).double()
+    hidden = DBN(4, [5], weight_init=Normal(std=1.0)).double()
     network = nn.Sequential(hidden, *([] if closed_form else [nn.Identity()]), Linear(5, 3).double())
 
     def gradient(batch):

@@ -5,12 +5,12 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, Gaussian
+from memcomp_lightning.models import DBN, Normal
 
 
 def dbn_with_biases(replicas=()):
     generator = rng.stream(0, "test model")
-    dbn = DBN(11, [7, 5, 3], replicas=replicas, weight_init=Gaussian(std=0.8), generator=generator)
+    dbn = DBN(11, [7, 5, 3], replicas=replicas, weight_init=Normal(std=0.8), generator=generator)
     with torch.no_grad():
         for rbm in dbn:
             rbm.b.normal_(0.3, 0.5, generator=generator)

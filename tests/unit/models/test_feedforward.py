@@ -8,7 +8,7 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import BatchNorm, BatchNormReluNetwork, Gaussian, Linear
+from memcomp_lightning.models import BatchNorm, BatchNormReluNetwork, Linear, Normal
 
 
 def inputs(*shape, seed=0):
@@ -50,7 +50,7 @@ def test_batch_norm_without_replicas_equals_torch():
 
 @pytest.mark.parametrize("replicas", [(), (3,), (2, 3)], ids=str)
 def test_linear_is_a_matrix_product_and_a_bias(replicas):
-    layer = Linear(7, 5, replicas=replicas, weight_init=Gaussian(std=1.0))
+    layer = Linear(7, 5, replicas=replicas, weight_init=Normal(std=1.0))
     with torch.no_grad():
         layer.bias.copy_(inputs(*replicas, 5, seed=1))
     x = inputs(*replicas, 11, 7)
@@ -59,7 +59,7 @@ def test_linear_is_a_matrix_product_and_a_bias(replicas):
 
 
 def test_network_equals_torch_layers():
-    ours = BatchNormReluNetwork(7, [5, 3], 2, weight_init=Gaussian(std=1.0))
+    ours = BatchNormReluNetwork(7, [5, 3], 2, weight_init=Normal(std=1.0))
     theirs = nn.Sequential()
     for layer in ours.layers:
         if isinstance(layer, Linear):
@@ -74,7 +74,7 @@ def test_network_equals_torch_layers():
 
 
 def test_network_replicas_equal_single_networks():
-    ours = BatchNormReluNetwork(7, [5, 3], 2, replicas=(3,), weight_init=Gaussian(std=1.0))
+    ours = BatchNormReluNetwork(7, [5, 3], 2, replicas=(3,), weight_init=Normal(std=1.0))
     one = BatchNormReluNetwork(7, [5, 3], 2)
     one.load_state_dict({name: tensor[1] for name, tensor in ours.state_dict().items()})
     x = inputs(3, 11, 7)

@@ -7,7 +7,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.models import DBN, RBM, Gaussian, Linear, Uniform, Xavier
+from memcomp_lightning.models import DBN, RBM, Linear, Normal, Uniform, Xavier
 
 N = 101 * 103
 
@@ -17,7 +17,7 @@ def draw(initialiser, shape=(101, 103)):
 
 
 def test_gaussian_has_mean_zero_and_its_deviation():
-    w = draw(Gaussian(std=0.3))
+    w = draw(Normal(std=0.3))
     assert abs(w.mean()) < 5 * 0.3 / math.sqrt(N)
     assert abs(w.std() - 0.3) < 5 * 0.3 / math.sqrt(2 * N)
     assert ((w.abs() < 0.3).float().mean() - 0.6827).abs() < 5 * 0.47 / math.sqrt(N)
@@ -41,7 +41,7 @@ def test_xavier_bound_counts_inputs_and_outputs(gain):
     assert abs(w.var() - bound**2 / 3) < 0.05 * bound**2 / 3
 
 
-@pytest.mark.parametrize("initialiser", [Gaussian(), Uniform(low=-1, high=1), Xavier()], ids=repr)
+@pytest.mark.parametrize("initialiser", [Normal(), Uniform(low=-1, high=1), Xavier()], ids=repr)
 @pytest.mark.parametrize("replicas", [(), (3,), (2, 3)], ids=str)
 def test_shape_and_stream(initialiser, replicas):
     first, again = draw(initialiser, (*replicas, 5, 7)), draw(initialiser, (*replicas, 5, 7))
@@ -66,15 +66,15 @@ def test_models_use_their_initialiser(build):
 
 
 def test_standard_deviation_zero_is_allowed():
-    assert not draw(Gaussian(std=0.0)).any()
+    assert not draw(Normal(std=0.0)).any()
     assert torch.equal(draw(Uniform(low=1.0, high=1.0)), torch.ones(101, 103))
 
 
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Gaussian(std=-0.1), r"std = -0.1 is not allowed: expected a number >= 0"),
-        (lambda: Gaussian(std=math.nan), r"std = nan is not allowed: expected a number >= 0"),
+        (lambda: Normal(std=-0.1), r"std = -0.1 is not allowed: expected a number >= 0"),
+        (lambda: Normal(std=math.nan), r"std = nan is not allowed: expected a number >= 0"),
         (lambda: Uniform(low=1.0, high=0.5), r"low = 1.0 is not allowed: expected a number <= high = 0.5"),
         (lambda: Xavier(gain=0.0), r"gain = 0.0 is not allowed: expected a number > 0"),
     ],

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import DBN, Gaussian, GaussianMoments, Shuffled, with_batch_norm_relu
+from memcomp_lightning.models import DBN, GaussianMoments, Normal, Shuffled, with_batch_norm_relu
 
 
 def dbn() -> DBN:
-    made = DBN(7, [5, 3], replicas=(2,), weight_init=Gaussian(std=1.0))
+    made = DBN(7, [5, 3], replicas=(2,), weight_init=Normal(std=1.0))
     with torch.no_grad():
         for rbm in made:
             rbm.b.copy_(torch.arange(rbm.b.numel()).view_as(rbm.b))
@@ -31,7 +31,7 @@ def test_shuffling_keeps_the_values_of_each_layer_and_replica_and_moves_them():
 
 
 def test_gaussian_has_the_moments_of_each_layer():
-    big = DBN(101, [103], replicas=(2,), weight_init=Gaussian(std=1.0))
+    big = DBN(101, [103], replicas=(2,), weight_init=Normal(std=1.0))
     with torch.no_grad():
         big[0].weight[0].uniform_(-1, 5, generator=rng.stream(0, "weights"))
         big[0].weight[1].uniform_(2, 3, generator=rng.stream(1, "weights"))

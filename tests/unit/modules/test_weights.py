@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Gaussian
+from memcomp_lightning.models import DBM, DBN, RBM, BatchNormReluNetwork, BoltzmannMachine, Normal
 from memcomp_lightning.models.connectivity import full
 from memcomp_lightning.modules import CheckpointError, DBNClassifier, load_weights, save_weights
 from memcomp_lightning.modules.weights import check_checkpoint
@@ -16,7 +16,7 @@ STAR = [(0, 1), (0, 2), (0, 3), (1, 2)]
 
 
 def machine(pairs: Any, **settings: Any) -> BoltzmannMachine:
-    return BoltzmannMachine(3, 1, pairs, weight_init=Gaussian(std=0.5), **settings)
+    return BoltzmannMachine(3, 1, pairs, weight_init=Normal(std=0.5), **settings)
 
 
 def without_pairs(state: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def test_weights_of_another_model_are_refused(tmp_path: Path, content: Any, mode
 
 
 def test_weights_of_a_smaller_dtype_are_exact(tmp_path: Path) -> None:
-    trained = RBM(5, 3, weight_init=Gaussian(std=0.3))
+    trained = RBM(5, 3, weight_init=Normal(std=0.3))
     save_weights(trained, tmp_path / "w.pt")
     model = RBM(5, 3).double()
     load_weights(model, tmp_path / "w.pt")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM, Gaussian
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.samplers.parallel_tempering import betas
 from memcomp_lightning.testing import small_rbm
 from memcomp_lightning.trained import sample
@@ -29,7 +29,7 @@ def test_what_a_draw_is_worth(time, spacing, n_draws):
 
 
 def test_a_third_of_the_starts_is_of_each_kind():
-    rbm = RBM(30, 20, weight_init=Gaussian(std=3.0))
+    rbm = RBM(30, 20, weight_init=Normal(std=3.0))
     n = 300
     x = overdispersed(rbm, rbm.chains(), n, generator=rng.stream(0, "starts"))
     random, cooled, patterns = (x[kind::3] for kind in range(3))
