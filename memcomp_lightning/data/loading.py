@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -11,9 +12,12 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.data.missing import split_missing
-from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.types import Batch
+
+_ENTRIES_CHECKED = 2**22
+"""Entries that are held at once while values are looked at."""
 
 
 class SparseRows(NamedTuple):
@@ -81,6 +85,10 @@ class Batches:
         observed: Where ``v`` is known, a mask of its shape; None is wherever it is not NaN.
         units: Kind of the visible units, which makes entries of the data when a batch is taken, so that a category
             takes a number in memory and no row of zeros; None takes the data as they are.
+        check: Whether values that the units do not take are looked for, once; data modules have done it.
+
+    Raises:
+        SettingError: Sizes that do not fit, or a value that the units do not take, by its column and row.
 
     >>> batches = Batches(torch.zeros(7, 2), torch.zeros(7).long(), 3, chunk_size=2, shuffle=True, seed=0)
     >>> [(len(batch.label), batch.closes_step) for batch in batches]
@@ -100,6 +108,7 @@ class Batches:
         weight: Tensor | None = None,
         observed: Tensor | None = None,
         units: Units | None = None,
+        check: bool = True,
     ) -> None:
         filled = len(v.shape) >= 2 and v.shape.numel() > 0
         require(filled, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
@@ -125,6 +134,8 @@ class Batches:
         require(fits, "observed and units", "given", "None where images are in sparse rows")
         if not isinstance(v, SparseRows):
             v, observed = split_missing(v, observed, "v")
+            if units is not None and check:
+                _check_values(units, v, observed)
         # Contiguous, the images of all replicas are the rows of one matrix.
         self._v, self._label, self._weight, self._observed, self._units = v, label, weight, observed, units
         if self._shuffle:
@@ -248,6 +259,23 @@ class _Chunk(NamedTuple):
     step: slice
     share: float
     closes_step: bool
+
+
+def _check_values(units: Units, v: Tensor, observed: Tensor | None) -> None:
+    """Raise a SettingError for data that the units do not take; a part of the rows has its entries at once."""
+    rows = max(1, _ENTRIES_CHECKED // (units.n * math.prod(v.shape[:-2])))
+    for first in range(0, v.shape[-2], rows):
+        at = (..., slice(first, first + rows), slice(None))
+        mask = None if observed is None else units.over_sites(observed[at])
+        try:
+            units.check(units.encode(v[at]), mask)
+        except SettingError as error:
+            raise SettingError(_with_row(str(error), first)) from None
+
+
+def _with_row(message: str, first: int) -> str:
+    """A message about a part of the rows, with the row counted from the first of all."""
+    return re.sub(r", row (\d+)", lambda found: f", row {first + int(found[1])}", message, count=1)
 
 
 def _taken(v: Tensor, positions: slice, index: Tensor | None) -> Tensor:

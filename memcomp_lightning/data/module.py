@@ -238,6 +238,7 @@ class RowsDataModule(LightningDataModule):
             observed=self._train.observed,
             weight=self._train.weight,
             units=self.units,
+            check=False,
         )
 
     def _evaluation_batches(self, kept: Rows) -> Batches:
@@ -246,7 +247,8 @@ class RowsDataModule(LightningDataModule):
             v, label = v.expand(*self.replicas, -1, -1), label.expand(*self.replicas, -1)
             observed = None if observed is None else observed.expand(*self.replicas, -1, -1)
         settings: dict[str, Any] = {"chunk_size": self._chunk_size, "shuffle": False, "seed": self._seed}
-        return Batches(v, label, None, **settings, observed=observed, weight=weight, units=self.units)
+        settings |= {"observed": observed, "weight": weight, "units": self.units, "check": False}
+        return Batches(v, label, None, **settings)
 
     def _values(self, kept: Rows) -> tuple[Tensor, Tensor]:
         return self.units.encode(kept.v, check=False), kept.label

@@ -3,6 +3,7 @@ import torch
 
 from memcomp_lightning.data import Batches
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.models.units import Categorical, Mixed, Spin
 
 
 def numbered(*shape):
@@ -213,3 +214,21 @@ def test_tensors_that_do_not_fit_are_refused():
 def test_negative_epoch_is_refused():
     with pytest.raises(SettingError, match="epoch = -1"):
         make(23).set_epoch(-1)
+
+
+def test_values_that_the_units_do_not_take_are_refused_by_their_place(monkeypatch):
+    """Also where the rows are looked at in parts, and not where they are missing."""
+    monkeypatch.setattr("memcomp_lightning.data.loading._ENTRIES_CHECKED", 2 * 7)
+    units = Mixed(Categorical([3, 2]), Spin(2))
+    v = torch.tensor([[0.0, 1, 1, -1]]).repeat(9, 1)
+    Batches(v, torch.zeros(9).long(), 3, chunk_size=3, shuffle=True, seed=0, units=units)
+    for row, column, value in ((0, 1, 2.0), (5, 0, 0.5), (8, 3, 0.0), (7, 2, 3.0)):
+        wrong = v.clone()
+        wrong[row, column] = value
+        settings = {"batch_size": 3, "chunk_size": 3, "shuffle": True, "seed": 0, "units": units}
+        if value:  # of spins 0 is a mean
+            with pytest.raises(SettingError, match=rf"column {column}, row {row} = {value}"):
+                Batches(wrong, torch.zeros(9).long(), **settings)
+        observed = torch.ones_like(v, dtype=torch.bool)
+        observed[row, column] = False
+        Batches(wrong, torch.zeros(9).long(), **settings, observed=observed)
