@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM
-from memcomp_lightning.models import Gaussian as NormalWeights
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.bit_form import descend
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin, Units, all_states
 from memcomp_lightning.samplers import BlockAnnealing, GroundState, NegativePhaseSampler, positive_phase
@@ -48,7 +47,7 @@ N_STARTS = 10_000
 def random_rbm(visible: Units, hidden: Units, strength: float, seed: int) -> RBM:
     """Weights and biases are normal; real units have precisions of 1/2 to 2."""
     generator = rng.stream(seed, "ground states")
-    rbm = RBM(visible=visible, hidden=hidden, weight_init=NormalWeights(std=strength), generator=generator)
+    rbm = RBM(visible=visible, hidden=hidden, weight_init=Normal(std=strength), generator=generator)
     with torch.no_grad():
         for bias in (rbm.b, rbm.c):
             bias.normal_(0.0, strength, generator=generator)

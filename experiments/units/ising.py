@@ -17,8 +17,7 @@ from torch.optim import Adam
 
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
-from memcomp_lightning.models import DBN, RBM, BoltzmannMachine
-from memcomp_lightning.models import Gaussian as NormalWeights
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine, Normal
 from memcomp_lightning.models.connectivity import grid
 from memcomp_lightning.models.units import Spin
 from memcomp_lightning.samplers import PCD, GroundState, ModeAssisted, ModeSchedule, PseudoLikelihood
@@ -217,7 +216,7 @@ def trained(data: Data, model: str, method: str, rate: float, passes: int) -> tu
     batches = Batches(data.rows, torch.zeros(n_seeds, n_rows).long(), BATCH, n_rows, shuffle=True, seed=0)
     stage: Any
     if "hidden" in model:
-        rbm = RBM(visible=Spin(n), hidden=Spin(n), replicas=(n_seeds,), weight_init=NormalWeights(std=0.05))
+        rbm = RBM(visible=Spin(n), hidden=Spin(n), replicas=(n_seeds,), weight_init=Normal(std=0.05))
         stage = Greedy(_as_network(rbm))
     else:
         connectivity = grid(side, side) if "grid" in model else None

@@ -18,8 +18,7 @@ from torch.optim import Adam
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.likelihood import log_likelihood, log_partition_function
-from memcomp_lightning.models import DBN
-from memcomp_lightning.models import Gaussian as NormalWeights
+from memcomp_lightning.models import DBN, Normal
 from memcomp_lightning.models.units import Gaussian
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import (
@@ -122,7 +121,7 @@ class Scores(NamedTuple):
 def trained(data: Data, method: str, n_hidden: int, rate: float, passes: int) -> Scores:
     """Of an RBM for each seed, all seeds side by side; minus infinity where training diverged."""
     n_seeds, n_rows, n = data.train.shape
-    weights = NormalWeights(std=0.1)
+    weights = Normal(std=0.1)
     dbn = DBN(visible=Gaussian(n), hidden_sizes=[n_hidden], replicas=(n_seeds,), weight_init=weights)
     dbn[0].visible.start(data.train.mean(-2), data.train.var(-2))
     batches = Batches(data.train, torch.zeros(n_seeds, n_rows).long(), BATCH, n_rows, shuffle=True, seed=0)

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import RBM
-from memcomp_lightning.models import Gaussian as NormalWeights
+from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.units import Spin
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "units"))
@@ -40,7 +39,7 @@ def test_the_grid_is_sampled_exactly(kind):
 
 def test_effective_couplings_of_units_with_two_connections_are_the_known_ones():
     # A hidden spin that two visible ones are coupled to is a coupling of atanh(tanh(w) tanh(u)) between these.
-    rbm = RBM(visible=Spin(4), hidden=Spin(2), replicas=(1,), weight_init=NormalWeights(std=0.0))
+    rbm = RBM(visible=Spin(4), hidden=Spin(2), replicas=(1,), weight_init=Normal(std=0.0))
     with torch.no_grad():
         rbm.weight[0] = torch.tensor([[0.7, -0.5, 0.0, 0.0], [0.0, 0.3, 0.0, 0.9]])
         rbm.b[0] = torch.tensor([0.1, 0.2, -0.3, 0.0])
