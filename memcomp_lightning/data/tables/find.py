@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from memcomp_lightning.data.tables.cells import Cells
 from memcomp_lightning.data.tables.columns import KINDS, Binary, Category, Column, Probability, Real, SpinColumn
@@ -32,7 +33,10 @@ class Summary:
         n_numbers: Cells that are numbers.
         odd: The first cell that is no number, and its row from 1; None where there is none.
         distinct: Different cells, None where they are more than a thousand.
-        low, high, mean, squares: Of the numbers: least, largest, mean, and sum of squared deviations.
+        low, high: Least and largest number.
+        n_known: Cells of training rows that are not empty.
+        mean, squares: Of the numbers in training rows: mean, and sum of squared deviations.
+        varies: Whether the numbers in training rows differ.
         whole: Whether all numbers are whole.
         counts: Whether the numbers go up by one from row to row.
     """
@@ -45,14 +49,22 @@ class Summary:
     distinct: set[Any] | None = field(default_factory=set)
     low: float = math.inf
     high: float = -math.inf
+    n_known: int = 0
     mean: float = 0.0
     squares: float = 0.0
+    varies: bool = False
     whole: bool = True
     counts: bool = True
     _first: float = math.nan
+    _some: float = math.nan
 
-    def add(self, cells: Cells) -> None:
-        """Take in some more rows."""
+    def add(self, cells: Cells, trained: NDArray[np.bool_] | None = None) -> None:
+        """Take in some more rows.
+
+        Args:
+            cells: Of these rows.
+            trained: Which of them are training rows; None is all.
+        """
         empty, spelt = cells.empty, cells.spell_numbers
         odd = ~empty & ~spelt
         if self.odd is None and odd.any():
@@ -62,31 +74,38 @@ class Summary:
             self.distinct |= cells.distinct()
             if len(self.distinct) > _KEPT:
                 self.distinct = None
+        known = ~empty if trained is None else ~empty & trained
         if self.odd is None:
-            self._add_numbers(cells.numbers(), ~empty)
+            self._add_numbers(cells.numbers(), empty, known)
+        self.n_known += int(known.sum())
         self.n_numbers += int(spelt.sum())
         self.n_empty += int(empty.sum())
         self.n += len(empty)
 
-    def _add_numbers(self, numbers: Any, known: Any) -> None:
+    def _add_numbers(self, numbers: Any, empty: Any, known: Any) -> None:
         if math.isnan(self._first):
             self._first = float(numbers[0]) - self.n
         in_turn = numbers == self._first + self.n + np.arange(len(numbers))
         self.counts = self.counts and self._first.is_integer() and bool(in_turn.all())
+        x = numbers[~empty]
+        if len(x):
+            self.low, self.high = min(self.low, float(x.min())), max(self.high, float(x.max()))
+            self.whole = self.whole and bool((x == np.round(x)).all())
         x = numbers[known]
         if not len(x):
             return
-        self.low, self.high = min(self.low, float(x.min())), max(self.high, float(x.max()))
-        self.whole = self.whole and bool((x == np.round(x)).all())
-        n, m, mean = self.n_numbers, len(x), float(x.mean())
+        if math.isnan(self._some):
+            self._some = float(x[0])
+        self.varies = self.varies or bool((x != self._some).any())
+        n, m, mean = self.n_known, len(x), float(x.mean())
         change = mean - self.mean
         self.mean += change * m / (n + m)
         self.squares += float(np.square(x - mean).sum()) + change**2 * n * m / (n + m)
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the numbers."""
-        return math.sqrt(self.squares / max(self.n_numbers, 1))
+        """Standard deviation of the numbers in training rows."""
+        return math.sqrt(self.squares / max(self.n_known, 1))
 
     @property
     def words(self) -> list[Any]:
@@ -172,6 +191,10 @@ def _typed(name: str, kind: str) -> str:
     return f"Type 'data.columns={{{name}: {kind}}}'."
 
 
+def _split_otherwise(name: str) -> str:
+    return f"type another data.split_seed, or 'data.columns={{{name}: ignore}}'."
+
+
 def _left_out(summary: Summary) -> str | None:
     """Why a column is none for the model."""
     if summary.odd is None and summary.counts and summary.n > 2:
@@ -213,6 +236,8 @@ def _column(summary: Summary, kind: str | None, file: str) -> Column:
     if summary.distinct is not None and len(summary.distinct) == 1 and kind not in ("spin", "probability"):
         value = next(iter(summary.distinct))
         raise UserError(f"{place} has one value, {value}, in all rows: it says nothing. {_typed(name, 'ignore')}")
+    if not summary.n_known:
+        raise UserError(f"{place} has no value in the training rows: {_split_otherwise(name)}")
     if kind is None:
         kind = _kind(summary, file)
     if kind not in KINDS:
@@ -229,6 +254,9 @@ def _column(summary: Summary, kind: str | None, file: str) -> Column:
         row, cell = summary.odd
         raise UserError(f"{place}, row {row}: {cell!r} is no number: it cannot be {kind}.")
     if kind == "real":
+        if not summary.varies:
+            value = f"one value, {summary.mean:.7g},"
+            raise UserError(f"{place} has {value} in all training rows: {_split_otherwise(name)}")
         return Real(name, summary.mean, summary.deviation, summary.whole)
     return SpinColumn(name) if kind == "spin" else Probability(name)
 

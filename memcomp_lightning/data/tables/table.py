@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import torch
+from numpy.typing import NDArray
 
 from memcomp_lightning import rng
 from memcomp_lightning.data.images import PixelLayout
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.tables.cells import CellError, Cells
+from memcomp_lightning.data.tables.columns import Words
 from memcomp_lightning.data.tables.find import Summary, find
 from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame, opened
 from memcomp_lightning.data.tables.schema import TableSchema
@@ -70,6 +72,23 @@ class TableData:
             lines.append((self.schema.weight, "weight", ""))
         lines += [(name, "ignored", reason) for name, reason in self.ignored.items()]
         return _table(lines, self)
+
+    @property
+    def unseen(self) -> dict[str, list[str]]:
+        """Words of columns and classes that are in no training row, but in test rows or in a run before."""
+        found, (v, label, observed, _) = {}, self.train
+        numbers = {
+            column: v[:, site] if observed is None else v[observed[:, site], site]
+            for site, column in enumerate(self.schema.of_sites)
+            if isinstance(column, Words)
+        }
+        if self.schema.label is not None:
+            numbers[self.schema.label] = label[label != UNLABELLED]
+        for column, some in numbers.items():
+            seen = torch.bincount(some.long(), minlength=len(column.words)).tolist()
+            if words := [str(word) for word, n in zip(column.words, seen, strict=True) if not n]:
+                found[column.name] = words
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +161,10 @@ def table_data(
     picture: tuple[int, int] | None = None,
     schema: TableSchema | None = None,
 ) -> TableData:
-    """Find the columns of a table in one pass over its rows, and make numbers of them in a second one.
+    """Find the columns of a table in one pass over its rows, and make numbers of them in another one.
+
+    Kinds and words are those of all rows, so that a rare word among the test rows is no error. Means and scales
+    are those of the training rows: to know which these are, rows that are split are counted first.
 
     Args:
         begin: Begins to read the training rows.
@@ -155,7 +177,12 @@ def table_data(
         schema: What the columns are; None finds it out.
     """
     further, given = further or {}, _named(columns)
-    summaries, n, named = _summaries(begin(), name, {column for column, kind in given.items() if kind == "ignore"})
+    order, n_test = None, 0
+    if "test" not in further:
+        order, n_test = _order(sum(batch.num_rows for batch in begin().batches), name, test_fraction, split_seed)
+    ignore = {column for column, kind in given.items() if kind == "ignore"}
+    trained = None if order is None else order < len(order) - n_test
+    summaries, n, named = _summaries(begin(), name, ignore, trained)
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
         schema, ignored = TableSchema(tuple(found.columns), found.label, found.weight, named), found.ignored
@@ -163,17 +190,24 @@ def table_data(
         ignored = _besides(schema, [summary.name for summary in summaries])
     apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
     layout = None if picture is None else _layout(picture, schema)
-    if "test" in apart:
-        (train,) = _split(begin(), name, schema, [n], None)
-        test = apart["test"]
-    else:
-        n_test = round(test_fraction * n)
-        allowed = f"a share that leaves at least 1 of the {n} rows on each side"
-        require(1 <= n_test < n, "data.test_fraction", test_fraction, allowed)
-        generator = rng.stream(split_seed, "test rows")
-        order = torch.randperm(n, generator=generator, device="cpu").numpy()
-        train, test = _split(begin(), name, schema, [n - n_test, n_test], order)
+    parts = _split(begin(), name, schema, [n - n_test, n_test], order)
+    train, test = parts[0], apart.get("test", parts[1])
     return TableData(train, test, apart.get("validation"), schema, name, layout, ignored)
+
+
+def _order(n: int, name: str, test_fraction: float, split_seed: int) -> tuple[NDArray[np.int64], int]:
+    """Place of each row among training and then test rows, and how many of these there are."""
+    _require_rows(n, name)
+    n_test = round(test_fraction * n)
+    allowed = f"a share that leaves at least 1 of the {n} rows on each side"
+    require(1 <= n_test < n, "data.test_fraction", test_fraction, allowed)
+    generator = rng.stream(split_seed, "test rows")
+    return torch.randperm(n, generator=generator, device="cpu").numpy(), n_test
+
+
+def _require_rows(n: int, name: str) -> None:
+    if n < 2:
+        raise UserError(f"{name} has {n} rows: expected two or more.")
 
 
 def data_of(table: Any, label: Any = None, *, name: str = "table", **settings: Any) -> TableData:
@@ -241,9 +275,14 @@ def _layout(picture: tuple[int, int], schema: TableSchema) -> PixelLayout:
     return PixelLayout(height, width)
 
 
-def _summaries(found: Opened, name: str, skipped: Collection[str]) -> tuple[list[Summary], int, bool]:
+def _summaries(
+    found: Opened, name: str, skipped: Collection[str], trained: NDArray[np.bool_] | None
+) -> tuple[list[Summary], int, bool]:
+    """What is known of each column, how many rows there are, and whether the columns have names of their own."""
     summaries: list[Summary] = []
     for batch in found.batches:
+        first = summaries[0].n if summaries else 0
+        some = None if trained is None else trained[first : first + batch.num_rows]
         if not summaries:
             summaries = [Summary(str(column)) for column in batch.schema.names]
         for summary, column in zip(summaries, batch.columns, strict=True):
@@ -251,7 +290,7 @@ def _summaries(found: Opened, name: str, skipped: Collection[str]) -> tuple[list
                 summary.n += batch.num_rows
                 continue
             try:
-                summary.add(Cells(column))
+                summary.add(Cells(column), some)
             except CellError as error:
                 row, cell = summary.n + error.row + 1, column[error.row].as_py()
                 raise UserError(
@@ -259,8 +298,7 @@ def _summaries(found: Opened, name: str, skipped: Collection[str]) -> tuple[list
                     f"{error.expected}. Type 'data.columns={{{summary.name}: ignore}}' to leave the column out."
                 ) from error
     n = summaries[0].n if summaries else 0
-    if n < 2:
-        raise UserError(f"{name} has {n} rows: expected two or more.")
+    _require_rows(n, name)
     return summaries, n, found.named
 
 
@@ -339,9 +377,12 @@ def _table(lines: list[tuple[str, str, str]], data: TableData) -> str:
     if len(lines) > MOST_LINES or not data.schema.named:
         kinds = [kind for _, kind, _ in lines]
         by_kind = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-        return f"{data.name}: {counts}\n  {len(lines)} columns: {by_kind}"
-    wide = [max(len(line[k]) for line in lines) for k in range(2)]
-    rows = [f"  {name:<{wide[0]}}  {kind:<{wide[1]}}  {text}".rstrip() for name, kind, text in lines]
+        rows = [f"  {len(lines)} columns: {by_kind}"]
+    else:
+        wide = [max(len(line[k]) for line in lines) for k in range(2)]
+        rows = [f"  {name:<{wide[0]}}  {kind:<{wide[1]}}  {text}".rstrip() for name, kind, text in lines]
+    if unseen := [f"{name} {', '.join(words[:6])}" for name, words in data.unseen.items()]:
+        rows.append(f"  in no training row: {'; '.join(unseen[:6])}{'; ...' if len(unseen) > 6 else ''}")
     return "\n".join([f"{data.name}: {counts}", *rows])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from memcomp_lightning import rng
 from memcomp_lightning.data import Table, TableDataModule
 from memcomp_lightning.data.schema import schema_of
 from memcomp_lightning.data.tables import TableSchema, data_of
@@ -55,7 +56,7 @@ def test_kinds_are_found() -> None:
     assert data.train.n + data.test.n == 180
     for word in (
         "age",
-        "34.63 +- 8.67",
+        "34.61 +- 8.82",
         "note",
         "180 different texts",
         "162 rows to train on, 18 test rows",
@@ -104,10 +105,46 @@ def test_whole_numbers_stay_whole() -> None:
 def test_real_columns_are_in_standard_deviations() -> None:
     own = pd.DataFrame({"x": 100 + 3 * np.random.default_rng(0).standard_normal(500), "y": ["a", "b"] * 250})
     data = data_of(own)
-    v = torch.cat((data.train.v, data.test.v))[:, 1]
+    v = data.train.v[:, 1]
     assert abs(float(v.mean())) < 1e-5
     assert float(v.var(correction=0)) == pytest.approx(1, abs=1e-5)
-    assert data.schema.log_scale == pytest.approx(np.log(own["x"].std(ddof=0)))
+    x = data.schema.decode(data.train.v)["x"]
+    assert data.schema.log_scale == pytest.approx(np.log(x.std()))
+
+
+def with_test_row(**cells: Any) -> Any:
+    """A frame of 40 rows, with other cells in one that is split off as a test row."""
+    own = pd.DataFrame({"x": [0.5 * (i % 7) for i in range(40)], "y": list("abc") * 13 + ["a"]})
+    place = torch.randperm(40, generator=rng.stream(0, "test rows")).tolist()
+    for name, cell in cells.items():
+        own.loc[place.index(39), name] = cell
+    return own
+
+
+def test_test_rows_say_nothing_of_means_and_scales(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, far = (data_of(with_test_row(x=x)) for x in (0.0, 1e6))
+    assert far.schema == usual.schema
+    assert float(far.test.v.abs().max()) > 1e5
+    monkeypatch.setattr("memcomp_lightning.data.tables.readers.ROWS", 7)
+    assert data_of(with_test_row(x=1e6)).schema.log_scale == pytest.approx(usual.schema.log_scale)
+
+
+def test_a_word_of_a_test_row_alone_is_known_and_said() -> None:
+    data = data_of(with_test_row(y="rare"), columns={"label": "y"})
+    assert "in no training row: y rare" in data.described()
+    data = data_of(with_test_row(y="rare"))
+    assert data.unseen == {"y": ["rare"]}
+    assert "rare" in data.schema.decode(data.test.v)["y"].tolist()
+    assert "in no training row" not in data_of(with_test_row()).described()
+
+
+@pytest.mark.parametrize(("x", "message"), [(0.1, "one value, 0.1, in all"), (None, "no value in the")])
+def test_training_rows_that_say_nothing_of_a_column(x: float | None, message: str) -> None:
+    own = with_test_row().assign(x=x)
+    place = torch.randperm(40, generator=rng.stream(0, "test rows")).tolist()
+    own.loc[[place.index(38), place.index(39)], "x"] = [2.5, 3.5]
+    with pytest.raises(UserError, match=f"column 'x' has {message} training rows: type another data.split_seed"):
+        data_of(own, columns={"x": "real"})
 
 
 def test_the_schema_survives_json() -> None:
@@ -327,7 +364,7 @@ REFUSED: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     ),
     "binary of three": (HEADED, {"columns": {"z": "binary"}}, "column 'z' has 3 different values: too many for a"),
     "huge": (
-        "x,y\n1e300,a\n2,b\n3,a\n",
+        "x,y\n1e300,a\n" + "2,b\n3,a\n" * 3,
         {},
         "column 'x', row 1: '1e300' is not allowed: expected a finite number",
     ),
