@@ -4,11 +4,11 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.data.rows import UNLABELLED, Rows
+from memcomp_lightning.data.rows import UNLABELLED, Part, Rows
 from memcomp_lightning.errors import require, require_count
 
 
-def with_label(rows: Rows, what: str) -> Rows:
+def with_label(rows: Rows, what: str) -> Part:
     """The rows that have a label; those of a replica axis are not for it.
 
     Raises:
@@ -16,7 +16,7 @@ def with_label(rows: Rows, what: str) -> Rows:
     """
     n = n_labels(rows.label)
     _require_some(n, what, "Or leave out fine-tuning: finetune.iterations=0.")
-    return rows if n == rows.n else rows.at(labelled_at(rows.label, n))
+    return Part(rows, None if n == rows.n else labelled_at(rows.label, n))
 
 
 def with_labels(

@@ -85,6 +85,8 @@ class Batches:
         observed: Where ``v`` is known, a mask of its shape; None is wherever it is not NaN.
         units: Kind of the visible units, which makes entries of the data when a batch is taken, so that a category
             takes a number in memory and no row of zeros; None takes the data as they are.
+        at: Places of the images among those of ``v`` and ``observed``, which then have no replica axes,
+            ``(*replicas, n)``; ``label`` and ``weight`` are those of the places. None takes all images.
         check: Whether values that the units do not take are looked for, once; data modules have done it.
 
     Raises:
@@ -108,11 +110,13 @@ class Batches:
         weight: Tensor | None = None,
         observed: Tensor | None = None,
         units: Units | None = None,
+        at: Tensor | None = None,
         check: bool = True,
     ) -> None:
         filled = len(v.shape) >= 2 and v.shape.numel() > 0
         require(filled, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
-        require(label.shape == v.shape[:-1], "label.shape", tuple(label.shape), f"{tuple(v.shape[:-1])}, as v")
+        shape = v.shape[:-1] if at is None else at.shape
+        require(label.shape == shape, "label.shape", tuple(label.shape), f"{tuple(shape)}, as v")
         n = label.shape[-1]
         if batch_size is not None:
             require_count("batch_size", batch_size)
@@ -130,14 +134,17 @@ class Batches:
         # One chunk that is the whole pass: the order cannot matter, and the tensors go out uncopied.
         self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
         sparse = isinstance(v, SparseRows)
-        fits = not sparse or (observed is None and units is None)
-        require(fits, "observed and units", "given", "None where images are in sparse rows")
+        fits = not sparse or (observed is None and units is None and at is None)
+        require(fits, "observed, units and at", "given", "None where images are in sparse rows")
         if not isinstance(v, SparseRows):
+            if at is not None and not self._shuffle and len(self._chunks) == 1:  # gathered once, not in each pass
+                v, observed, at = v[at], None if observed is None else observed[at], None
             v, observed = split_missing(v, observed, "v")
             if units is not None and check:
                 _check_values(units, v, observed)
         # Contiguous, the images of all replicas are the rows of one matrix.
         self._v, self._label, self._weight, self._observed, self._units = v, label, weight, observed, units
+        self._at = at
         if self._shuffle:
             self._v, self._label = v if isinstance(v, SparseRows) else v.contiguous(), label.contiguous()
             self._observed = None if observed is None else observed.contiguous()
@@ -159,9 +166,12 @@ class Batches:
         repeated._seeds = tuple(seeds)
         repeated._replicas = (len(seeds) * math.prod(self._replicas),)
         if not self._shuffle:
-            n, units = self._v.shape[-2:]
-            repeated._v = self._v.reshape(-1, n, units).repeat(len(seeds), 1, 1)
+            n, units = self._label.shape[-1], self._v.shape[-1]
             repeated._label = self._label.reshape(-1, n).repeat(len(seeds), 1)
+            if self._at is not None:
+                repeated._at = self._at.reshape(-1, n).repeat(len(seeds), 1)
+                return repeated
+            repeated._v = self._v.reshape(-1, n, units).repeat(len(seeds), 1, 1)
             if self._observed is not None:
                 repeated._observed = self._observed.reshape(-1, n, units).repeat(len(seeds), 1, 1)
         return repeated
@@ -171,6 +181,7 @@ class Batches:
         moved = copy.copy(self)
         moved._v, moved._label = self._v.to(device), self._label.to(device)
         moved._weight = None if self._weight is None else self._weight.to(device)
+        moved._at = None if self._at is None else self._at.to(device)
         moved._observed = None if self._observed is None else self._observed.to(device)
         moved._units = None if self._units is None else copy.deepcopy(self._units).to(device)
         return moved
@@ -219,9 +230,12 @@ class Batches:
             v, label = self._v.dense(rows), self._label[rows]
         else:
             index = None if order is None else order[..., positions]
-            v, label = _taken(self._v, positions, index), self._labels(positions, index)
+            label, places = self._labels(positions, index), index
+            if self._at is not None:
+                places = self._at[..., positions] if index is None else self._at.flatten()[index]
+            v = _taken(self._v, positions, places)
             if self._observed is not None:
-                observed = _taken(self._observed, positions, index)
+                observed = _taken(self._observed, positions, places)
             if self._units is not None:
                 v = self._units.encode(v, check=False)
                 observed = None if observed is None else self._units.over_sites(observed)

@@ -5,9 +5,12 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require
 
+_ROWS = 2**14
+"""That are looked at together."""
+
 
 def split_missing(v: Tensor, observed: Tensor | None, name: str) -> tuple[Tensor, Tensor | None]:
-    """Data with 0 in place of what is missing, and the mask of what is not; None where all is there.
+    """Data with 0 in place of what is missing, uncopied where it is so, and the mask; None where all is there.
 
     Args:
         v: Data, ``(*axes, n, n_sites)``; NaN is missing.
@@ -30,4 +33,7 @@ def split_missing(v: Tensor, observed: Tensor | None, name: str) -> tuple[Tensor
     hidden = (~observed.any(-1)).nonzero()
     row = hidden[0].tolist()[-1] if len(hidden) else 0
     require(not len(hidden), f"{name}, values known in row {row}", 0, "one or more", "Leave out the row.")
+    parts = zip(v.split(_ROWS, -2), observed.split(_ROWS, -2), strict=True)
+    if not any(bool(some.masked_fill(known, 0).any()) for some, known in parts):  # NaN is something
+        return v, observed
     return torch.where(observed, v, torch.zeros((), dtype=v.dtype, device=v.device)), observed

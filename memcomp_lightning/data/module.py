@@ -11,7 +11,7 @@ from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.labels import with_label, with_labels
 from memcomp_lightning.data.loading import Batches
-from memcomp_lightning.data.rows import UNLABELLED, Rows
+from memcomp_lightning.data.rows import UNLABELLED, Part, Rows
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
@@ -102,7 +102,7 @@ class RowsDataModule(LightningDataModule):
             n_parts = min(partitions, first_partitions)
         self.replicas: tuple[int, ...] = (n_parts,) if partitions > 1 else ()
         self._batch_size, self._chunk_size, self._seed = batch_size, chunk_size, seed
-        # Without parts and without a held-out set there is nothing to deal, and no copy of the rows.
+        # Without parts and without a held-out set there is nothing to deal.
         at = heldout_at = None
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
@@ -116,12 +116,12 @@ class RowsDataModule(LightningDataModule):
             at, heldout_at = with_labels(train.label, at, heldout_at, n, validation_fraction, seed=seed)
             found = sum(places.shape[-1] for places in (at, heldout_at) if places is not None)
             self.n_labels = found if 0 < found < n_part else None
-            test = with_label(test, "test rows")
-            validation = None if validation is None else with_label(validation, "rows of data.validation")
-        self._train, self._test = train if at is None else train.at(at), test
-        self._heldout = test if validation is None else validation
-        if heldout_at is not None:
-            self._heldout = train.at(heldout_at)
+        self._train = Part(train, at)
+        self._test = Part(test) if labels is None else with_label(test, "test rows")
+        self._heldout = self._test if heldout_at is None else Part(train, heldout_at)
+        if validation is not None:
+            what = "rows of data.validation"
+            self._heldout = Part(validation) if labels is None else with_label(validation, what)
         self.n_train = self._train.n
         self.train_batches(rank=0, world_size=1)
 
@@ -138,27 +138,27 @@ class RowsDataModule(LightningDataModule):
     @property
     def train(self) -> tuple[Tensor, Tensor]:
         """Training rows ``(*replicas, n, n_visible)`` and labels ``(*replicas, n)``, without those held out."""
-        return self._values(self._train)
+        return self._values(self._train.taken())
 
     @property
     def train_observed(self) -> Tensor | None:
         """Where the training rows are known, a mask of their shape; None is everywhere."""
-        return self._mask(self._train)
+        return self._mask(self._train.taken())
 
     @property
     def test(self) -> tuple[Tensor, Tensor]:
         """Test rows ``(n, n_visible)`` and labels ``(n,)``."""
-        return self._values(self._test)
+        return self._values(self._test.taken())
 
     @property
     def heldout(self) -> tuple[Tensor, Tensor]:
         """The rows of the validation: those held out, or the test rows, which all replicas share."""
-        return self._values(self._heldout)
+        return self._values(self._heldout.taken())
 
     @property
     def heldout_observed(self) -> Tensor | None:
         """Where they are known."""
-        return self._mask(self._heldout)
+        return self._mask(self._heldout.taken())
 
     @property
     def validation(self) -> tuple[Tensor, Tensor] | None:
@@ -169,7 +169,7 @@ class RowsDataModule(LightningDataModule):
     def has_gaps(self) -> bool:
         """Whether values of any rows are missing."""
         parts = (self._train, self._heldout, self._test)
-        return any(part.observed is not None and not bool(part.observed.all()) for part in parts)
+        return any(part.has_gaps for part in parts)
 
     @property
     def holds_out(self) -> bool:
@@ -202,12 +202,7 @@ class RowsDataModule(LightningDataModule):
     def some_train(self) -> Rows:
         """Training rows as values of the visible units: of large tables evenly spaced ones."""
         step = 1 if self.most_numbers is None else -(-self.n_train * self.n_visible // self.most_numbers)
-        v, label, observed, weight = self._train
-        if step > 1:
-            v, label = v[..., ::step, :], label[..., ::step]
-            observed = None if observed is None else observed[..., ::step, :]
-            weight = None if weight is None else weight[..., ::step]
-        some = Rows(v, label, observed, weight)
+        some = self._train.taken(step)
         return some._replace(v=self._values(some)[0], observed=self._mask(some))
 
     def train_dataloader(self) -> Batches:
@@ -227,7 +222,7 @@ class RowsDataModule(LightningDataModule):
     def train_batches(self, rank: int, world_size: int) -> Batches:
         """Return the shuffled training batches of one of ``world_size`` processes."""
         return Batches(
-            self._train.v,
+            self._train.rows.v,
             self._train.label,
             batch_size=self._batch_size,
             chunk_size=self._chunk_size,
@@ -235,19 +230,24 @@ class RowsDataModule(LightningDataModule):
             seed=self._seed,
             rank=rank,
             world_size=world_size,
-            observed=self._train.observed,
+            observed=self._train.rows.observed,
             weight=self._train.weight,
             units=self.units,
+            at=self._train.at,
             check=False,
         )
 
-    def _evaluation_batches(self, kept: Rows) -> Batches:
-        v, label, observed, weight = kept
+    def _evaluation_batches(self, part: Part) -> Batches:
+        v, observed, label, at = part.rows.v, part.rows.observed, part.label, part.at
         if label.ndim == 1:
-            v, label = v.expand(*self.replicas, -1, -1), label.expand(*self.replicas, -1)
-            observed = None if observed is None else observed.expand(*self.replicas, -1, -1)
+            label = label.expand(*self.replicas, -1)
+            if at is None:
+                v = v.expand(*self.replicas, -1, -1)
+                observed = None if observed is None else observed.expand(*self.replicas, -1, -1)
+            else:
+                at = at.expand(*self.replicas, -1)
         settings: dict[str, Any] = {"chunk_size": self._chunk_size, "shuffle": False, "seed": self._seed}
-        settings |= {"observed": observed, "weight": weight, "units": self.units, "check": False}
+        settings |= {"observed": observed, "weight": part.weight, "units": self.units, "at": at, "check": False}
         return Batches(v, label, None, **settings)
 
     def _values(self, kept: Rows) -> tuple[Tensor, Tensor]:

@@ -31,3 +31,45 @@ class Rows(NamedTuple):
     def n(self) -> int:
         """Number of rows of a replica."""
         return self.label.shape[-1]
+
+
+class Part(NamedTuple):
+    """Some rows of a data set by their places, so that none is held twice.
+
+    Attributes:
+        rows: Of the data set, without replica axes.
+        at: Places, ``(*replicas, n)``; None is all rows.
+    """
+
+    rows: Rows
+    at: Tensor | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of rows of a replica."""
+        return self.label.shape[-1]
+
+    @property
+    def label(self) -> Tensor:
+        """Class indices, ``(*replicas, n)``."""
+        return self.rows.label if self.at is None else self.rows.label[self.at]
+
+    @property
+    def weight(self) -> Tensor | None:
+        """How often each row counts, ``(*replicas, n)``; None is once."""
+        weight = self.rows.weight
+        return weight if weight is None or self.at is None else weight[self.at]
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a value is missing."""
+        if self.rows.observed is None:
+            return False
+        whole = self.rows.observed.all(-1)
+        return not bool((whole if self.at is None else whole[self.at]).all())
+
+    def taken(self, step: int = 1) -> Rows:
+        """Every ``step``-th of them, copied."""
+        if self.at is None:
+            return self.rows if step == 1 else Rows(*(None if x is None else x[::step] for x in self.rows))  # type: ignore[arg-type]
+        return self.rows.at(self.at[..., ::step])

@@ -73,7 +73,8 @@ def test_both_loops_end_with_the_same_weights(
         assert one.equal(other)
         assert bool(one.isfinite().all())
     filled = data()
-    filled._train = filled._train._replace(observed=None)  # zeros in place of what is missing: another training
+    rows = filled._train.rows._replace(observed=None)  # zeros in place of what is missing: another training
+    filled._train = filled._train._replace(rows=rows)
     third = RBM(visible=units, n_hidden=n_hidden, replicas=data().replicas)
     for _ in pretrain(Greedy(third), filled.train_batches(0, 1), sampler, iterations=2, optimizer=OPTIMIZER):
         pass

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout
+from memcomp_lightning.data.missing import split_missing
 from memcomp_lightning.errors import SettingError
 
 N_TRAIN, N_TEST = 41, 13
@@ -92,6 +93,24 @@ def test_replicas_share_the_test_images_without_a_copy():
     storage = data.images.test_v.untyped_storage().data_ptr()
     assert all(batch.v.untyped_storage().data_ptr() == storage for batch in batches)
     assert numbers(batches).equal(torch.arange(41, 54).expand(3, -1))
+
+
+@pytest.mark.parametrize("partitions", [1, 3])
+def test_parts_are_taken_from_the_images_without_a_copy(partitions):
+    data = make(partitions=partitions, validation_fraction=0.3, labels=12, chunk_size=3)
+    for loader in (data.train_dataloader(), data.val_dataloader()):
+        assert loader._v.data_ptr() == data.images.train_v.data_ptr()
+    assert numbers(data.val_dataloader()).equal((data.heldout[0][..., 0] * 64).long())
+    twice = numbers(data.val_dataloader().repeated([0, 1]))
+    assert twice.equal(numbers(data.val_dataloader()).view(partitions, -1).repeat(2, 1))
+
+
+def test_a_mask_over_zeros_needs_no_copy():
+    v, observed = torch.tensor([[0.0, 1.0], [1.0, 1.0]]), torch.tensor([[False, True], [True, True]])
+    assert split_missing(v, observed, "v")[0] is v
+    for odd in (2.0, torch.nan):
+        v[0, 0] = odd
+        assert split_missing(v, observed, "v")[0].tolist() == [[0, 1], [1, 1]]
 
 
 def test_all_images_at_once():

@@ -131,9 +131,10 @@ def test_labels_follow_the_seed_and_held_out_rows_do_not():
 def test_totals_of_the_classes_count_weights():
     data = make(labels=12)
     assert data.class_totals.tolist() == [6, 4, 2]
-    weight = torch.arange(1.0, 13)
-    data._train = data._train._replace(weight=weight)
-    assert data.class_totals.tolist() == [float(weight[data._train.label == k].sum()) for k in range(3)]
+    weight = torch.arange(1.0, 61)
+    data._train = data._train._replace(rows=data._train.rows._replace(weight=weight))
+    own = weight[data._train.at]
+    assert data.class_totals.tolist() == [float(own[data._train.label == k].sum()) for k in range(3)]
 
 
 @pytest.mark.parametrize(
