@@ -6,18 +6,41 @@ import json
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+
+_waiting: ContextVar[dict[Path, Path] | None] = ContextVar("waiting", default=None)
+"""Files that are written, by their places, to which they move together; None where each moves by itself."""
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
     """Give a file beside ``path`` to write; rename it on success, so that an interruption leaves the old one."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial, waiting = path.with_name(f".{path.name}.{os.getpid()}.partial"), _waiting.get()
     try:
         yield partial
-        partial.replace(path)
+        if waiting is None:
+            partial.replace(path)
+        else:
+            waiting[path] = partial
     finally:
-        partial.unlink(missing_ok=True)
+        if waiting is None or path not in waiting:
+            partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def written_together() -> Iterator[None]:
+    """Move files that are written inside to their places at the end, so that an error leaves none of them."""
+    waiting: dict[Path, Path] = {}
+    before = _waiting.set(waiting)
+    try:
+        yield
+        for path, partial in waiting.items():
+            partial.replace(path)
+    finally:
+        _waiting.reset(before)
+        for partial in waiting.values():
+            partial.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -16,6 +16,7 @@ from memcomp_lightning.cli.output import refuse, say
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.files import written_together
 from memcomp_lightning.modules import CheckpointError
 
 T = TypeVar("T")
@@ -105,13 +106,14 @@ def existing(path: str) -> Path:
 def carry_out(
     usage: Usage[T], act: Callable[[list[str], T], None], arguments: Sequence[str] | None = None
 ) -> None:
-    """Read the command line, and act; what the user can put right ends the command by one line."""
+    """Read the command line, and act; what the user can put right ends it by one line, with no file written."""
     typed = sys.argv[1:] if arguments is None else list(arguments)
     if {"--help", "-h"} & set(typed):
         say(usage.help)
         return
     try:
         places, settings = usage.read(typed)
-        act(places, settings)
+        with written_together():
+            act(places, settings)
     except (UserError, SettingError, CheckpointError, OSError) as error:
         refuse(usage.command, UserError(in_words(error)))

@@ -2,7 +2,9 @@
 
 import gzip
 import io
+import os
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ TABLES = tuple(ending for ending in ENDINGS if ending != ".fasta")
 SEQUENCE = "sequence"
 """The column that FASTA files are made of; another one, ``name``, gives the headers."""
 
+_NO_ARROW = "Parquet needs Arrow, which is not installed: pip install pyarrow."
+
 
 def check_output(path: Path, *, overwrite: bool, endings: Sequence[str] = ENDINGS) -> None:
     """Refuse, before anything is computed, a file that cannot be written or is there already.
@@ -35,6 +39,10 @@ def check_output(path: Path, *, overwrite: bool, endings: Sequence[str] = ENDING
         raise UserError(f"output={path}: {'this is a folder' if path.is_dir() else 'there is no such folder'}.")
     if path.exists() and not overwrite:
         raise UserError(f"output={path}: the file is there already. Choose another, or type overwrite=true.")
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"output={path}: you may not write in its folder. Choose another.")
+    if path.suffix.lower() == ".parquet" and find_spec("pyarrow") is None:
+        raise UserError(f"output={path}: {_NO_ARROW}")
 
 
 def write_columns(columns: Columns, path: Path, *, overwrite: bool = False) -> None:
@@ -90,7 +98,7 @@ def _parquet(columns: Columns, path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise UserError("Parquet needs Arrow, which is not installed: pip install pyarrow.") from error
+        raise UserError(_NO_ARROW) from error
     parquet.write_table(pa.table({name: pa.array(x, from_pandas=True) for name, x in columns.items()}), path)
 
 

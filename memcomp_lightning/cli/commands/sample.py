@@ -155,6 +155,8 @@ def _checked_figure(settings: Settings, schema: Schema) -> Path:
         raise UserError(f"figure={figure}: the rows of this run are no pictures. Leave it out.")
     if figure.suffix.lower() != ".png" or not figure.parent.is_dir():
         raise UserError(f"figure={figure}: expected a file that ends in .png, in a folder that is there.")
+    if settings.figures is not None and Path(settings.figures) == figure:
+        raise UserError(f"figure={figure}: figures go there, too. Choose another file.")
     if figure.exists() and not settings.overwrite:
         raise UserError(f"figure={figure}: the file is there already. Choose another, or type overwrite=true.")
     return figure

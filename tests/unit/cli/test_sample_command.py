@@ -162,6 +162,32 @@ def test_pictures_are_an_array_that_can_be_given_again(use):
     np.testing.assert_array_equal(whole[:, 1], pictures[:, 1].repeat(2, axis=0))
 
 
+def test_of_several_files_all_are_written_or_none(use, capsys, monkeypatch):
+    folder = use(PICTURES, RBM(6, 3))
+    (folder / "some.npz").write_text("mine")
+    both = ["output=some.npz", "figure=some.png", "n=9"]
+    refused(capsys, *both)
+    assert "figures go there" in refused(capsys, *both[1:], "figures=some.png")
+    with monkeypatch.context() as patch:
+
+        def full(path, *_, **__):
+            path.write_text("half")
+            raise OSError("no space left")
+
+        patch.setattr("matplotlib.image.imsave", full)
+        assert "no space left" in refused(capsys, *both, "overwrite=true")
+    assert [path.name for path in folder.iterdir()] == ["some.npz"]
+    assert (folder / "some.npz").read_text() == "mine"
+    command.main(["run", *both, "overwrite=true"])
+    assert sorted(path.name for path in folder.iterdir()) == ["some.npz", "some.png"]
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_rows_are_drawn(table, capsys, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)
+    monkeypatch.setattr(command, "load", None)
+    assert "you may not write in its folder" in refused(capsys)
+
+
 class Letters:
     """A schema whose sites have letters, as those of sequences."""
 
