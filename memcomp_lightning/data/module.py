@@ -177,6 +177,14 @@ class RowsDataModule(LightningDataModule):
         return self._heldout is not self._test
 
     @property
+    def fingerprints(self) -> dict[str, str]:
+        """Of all training rows, of the test rows, and of the rows that those held out are taken from."""
+        parts = {"train": self._train, "test": self._test}
+        if self.holds_out:
+            parts["held-out"] = self._heldout
+        return {name: part.rows.fingerprint for name, part in parts.items()}
+
+    @property
     def class_names(self) -> list[str]:
         """The classes in words."""
         return [str(k) for k in range(self.n_classes)] if self.schema is None else self.schema.class_names

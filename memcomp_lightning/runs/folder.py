@@ -118,6 +118,20 @@ class RunFolder:
             )
         write_json(self.path / "schema.json", schema)
 
+    def keep_rows(self, fingerprints: Mapping[str, str]) -> None:
+        """Write which rows these are; a UserError if training began with others."""
+        if self.rows not in (None, fingerprints):
+            raise UserError(
+                f"the rows of run folder {self.path} have changed since its training began. Choose another folder "
+                "with hydra.run.dir=PATH, or bring the data back."
+            )
+        write_json(self.path / "rows.json", fingerprints)
+
+    @property
+    def rows(self) -> dict[str, str] | None:
+        """What was kept by :meth:`keep_rows`."""
+        return self._read("rows.json")
+
     @property
     def schema(self) -> dict[str, Any] | None:
         """What was kept by :meth:`keep_schema`."""

@@ -39,6 +39,27 @@ def history_with(earlier: RunFolder, weights: str) -> list[dict[str, Any]]:
     return [*earlier.history, last]
 
 
+def seen_before(earlier: RunFolder, rows: Mapping[str, str]) -> str:
+    """Which rows that judge a run may have been trained on by those that it goes on from; nothing where none.
+
+    The same training rows are split as they were, and the same test rows were test rows then, too.
+
+    Args:
+        earlier: The run that it goes on from, finished.
+        rows: Fingerprints of its own rows, as of :class:`memcomp_lightning.data.RowsDataModule`.
+    """
+    theirs, result = earlier.rows or {}, earlier.result or {}
+    if said := result.get("seen_before"):
+        return str(said)
+    if theirs.get("train") == rows["train"]:
+        return ""
+    others = " and ".join(name for name in ("test", "held-out") if name in rows and rows[name] != theirs.get(name))
+    return others and (
+        f"The {others} rows may be among those that {earlier.path} was trained on: its rows were others. They are "
+        "safe with the same data, or with the same files data.test=FILE and data.validation=FILE in both runs."
+    )
+
+
 def total_passes(history: Sequence[Mapping[str, Any]], own: Passes) -> Passes:
     """Passes that led to the weights of a run, over its history.
 

@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
@@ -21,7 +22,7 @@ from memcomp_lightning.modules import Classifier, EnergyPretraining, NotTrainedE
 from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint, write_tensors
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.runs.history import passes_of, short, total_passes
+from memcomp_lightning.runs.history import passes_of, seen_before, short, total_passes
 from memcomp_lightning.runs.table import final_log_likelihoods
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
@@ -53,8 +54,15 @@ def run(
     done = folder.finished_stages
     records: dict[str, Any] = {}
     keeps, schema = True, plan.stages[0].data.schema
+    seen = ""
     if schema is not None and int(getattr(rank_zero_only, "rank", 0)) == 0:
+        rows = plan.stages[0].data.fingerprints
         folder.keep_schema(schema.as_json())
+        folder.keep_rows(rows)
+        if folder.history:
+            seen = seen_before(RunFolder(Path(folder.history[-1]["run"])), rows)
+    if seen:
+        log.warning(seen)
     if plan.finetuning is not None and plan.finetuning.data.has_gaps:
         log.info(
             "Where inputs of the classifier are missing, the pretrained model draws them, anew in each pass; "
@@ -82,6 +90,8 @@ def run(
     if folder.history:
         result["history"] = short(folder.history)
         result["total_passes"] = total_passes(folder.history, passes_of(records))
+        if seen:
+            result["seen_before"] = seen
     if choice is not None:
         result["choice"] = choice
     if plan.finetuning is not None:

@@ -100,7 +100,8 @@ def _with_earlier_runs(result: dict[str, Any]) -> str:
         for stage, models in result["total_passes"].items()
         for model, n in models.items()
     ]
-    return f"\nGoes on from {result['history'][-1]['run']}. Passes in all: {', '.join(passes)}"
+    seen = f"\n{result['seen_before']}" if "seen_before" in result else ""
+    return f"\nGoes on from {result['history'][-1]['run']}. Passes in all: {', '.join(passes)}{seen}"
 
 
 def closing_lines(folder: Path) -> str:

@@ -15,6 +15,7 @@ BARS = [*QUIET, "data=shifting_bars", "data.source.copies=3", "sampler=pcd", "sa
 ONE = [*BARS, "model=one_layer", "model.hidden_sizes=[5]", "finetune.iterations=0"]
 WHOLE = [*ONE, "pretrain.batch_size=null"]
 """All images an update: no order that could differ."""
+SEEN = "may be among those that"
 CENTRED = "pretrain.centring={_target_:memcomp_lightning.objective.Centring,rate:0.05}"
 
 
@@ -53,6 +54,7 @@ def test_more_passes_are_those_of_the_longer_run(memcomp_train: Run) -> None:
     assert same(weights("more"), weights("long"))
     assert contents("short") == before
     assert f"The chains of {name} are kept." in said
+    assert SEEN not in said
     assert f"Passes in all: pretrain {name} 5" in said
     short = str(Path("short").absolute())
     history = found("more", "history.json")["runs"]
@@ -141,7 +143,10 @@ def test_new_rows_of_the_same_columns_are_read_as_the_old_ones(memcomp_train: Ru
     table("other.csv", "weight,kind", 0.5, "abc")
     small = [*QUIET, "data=table", "data.path=old.csv", "pretrain.iterations=1", "pretrain.batch_size=null"]
     done(memcomp_train(*small, "hydra.run.dir=first"))
-    done(memcomp_train("continue=first", "data.path=new.csv", "hydra.run.dir=second"))
+    said = done(memcomp_train("continue=first", "data.path=new.csv", "hydra.run.dir=second"))
+    before_training_and_after = said.count(f"The test rows {SEEN} {Path.cwd()}/first was trained on")
+    assert before_training_and_after == 2
+    assert SEEN in done(memcomp_train("continue=second", "hydra.run.dir=again"))  # by the first of the two
     assert found("second", "schema.json") == found("first", "schema.json")
     for settings, message in (
         (["data.path=other.csv"], "other.csv has no column 'size'"),
