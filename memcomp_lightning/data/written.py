@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.data.schema import Columns
+from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, written_whole
 
@@ -43,6 +43,17 @@ def check_output(path: Path, *, overwrite: bool, endings: Sequence[str] = ENDING
         raise UserError(f"output={path}: you may not write in its folder. Choose another.")
     if path.suffix.lower() == ".parquet" and find_spec("pyarrow") is None:
         raise UserError(f"output={path}: {_NO_ARROW}")
+
+
+def in_one_array(columns: Columns, schema: Schema, path: Path) -> Columns:
+    """Columns of an ``.npz`` of arrays or pictures as one array, as it is read again; all others as they are."""
+    numbered = not getattr(schema, "named", True) and list(columns) == [str(k) for k in range(len(columns))]
+    if not path.name.lower().endswith(".npz") or not (numbered or isinstance(schema, ImageSchema)):
+        return columns
+    rows = np.stack(list(columns.values()), axis=1)
+    if isinstance(schema, ImageSchema) and schema.layout.pixels is None:
+        rows = rows.reshape(-1, schema.layout.height, schema.layout.width)
+    return {getattr(schema, "key", None) or "x": rows}
 
 
 def write_columns(columns: Columns, path: Path, *, overwrite: bool = False) -> None:

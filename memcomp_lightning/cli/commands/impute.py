@@ -6,7 +6,7 @@ from pathlib import Path
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
-from memcomp_lightning.data.written import ENDINGS, TABLES, check_output, write_columns
+from memcomp_lightning.data.written import ENDINGS, TABLES, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
 from memcomp_lightning.plotting.written import check_figures, write_figures
@@ -81,7 +81,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
     found = impute(run, rows, m=settings.m, seed=settings.seed, chains=chains)
     for draw, path in enumerate(outputs):
         v = found.completed(None if settings.m is None else draw)
-        write_columns(completed_columns(run.needed_schema, table, v), path, overwrite=settings.overwrite)
+        columns = in_one_array(completed_columns(run.needed_schema, table, v), run.needed_schema, path)
+        write_columns(columns, path, overwrite=settings.overwrite)
     if gaps is not None:
         write_columns(gap_columns(run.needed_schema, found), gaps, overwrite=settings.overwrite)
     if settings.figures is not None:

@@ -11,8 +11,8 @@ from torch import Tensor
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
-from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
-from memcomp_lightning.data.written import SEQUENCE, check_output, write_columns
+from memcomp_lightning.data.schema import ImageSchema, Schema
+from memcomp_lightning.data.written import SEQUENCE, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.trained import load
@@ -102,7 +102,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
         seed=settings.seed,
     )
     seconds = time.perf_counter() - begin
-    write_columns(_columns(v, schema, output), output, overwrite=settings.overwrite)
+    columns = in_one_array(schema.decode(v), schema, output)
+    write_columns(columns, output, overwrite=settings.overwrite)
     if beside is not None:
         from memcomp_lightning.plotting.written import write_figures
         from memcomp_lightning.trained.figures import figures_of
@@ -160,14 +161,6 @@ def _checked_figure(settings: Settings, schema: Schema) -> Path:
     if figure.exists() and not settings.overwrite:
         raise UserError(f"figure={figure}: the file is there already. Choose another, or type overwrite=true.")
     return figure
-
-
-def _columns(v: Tensor, schema: Schema, output: Path) -> Columns:
-    """The user's columns; pictures of an .npz as one array, as ``given=`` reads them."""
-    if not (isinstance(schema, ImageSchema) and output.name.lower().endswith(".npz")):
-        return schema.decode(v)
-    v = v.cpu()
-    return {"x": (v if schema.layout.pixels is not None else schema.layout.to_picture(v)).numpy()}
 
 
 def _draw(v: Tensor, schema: ImageSchema, figure: Path) -> None:

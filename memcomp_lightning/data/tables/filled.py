@@ -33,7 +33,7 @@ def filled(path: Path, schema: TableSchema, v: Tensor) -> Columns:
     own = {column.name: column for column in schema.columns}
     parts: dict[str, list[NDArray[Any]]] = {}
     n = 0
-    for batch in opened(path).batches:
+    for batch in opened(path, key=schema.key).batches:
         here = numbers[n : n + batch.num_rows]
         n += batch.num_rows
         if len(here) != batch.num_rows:

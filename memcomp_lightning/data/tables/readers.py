@@ -35,7 +35,8 @@ def opened(path: Path, *, key: str | None = None) -> Opened:
 
     Args:
         path: CSV or TSV (also .gz, .bz2), Parquet, Excel, ``.npy``, ``.npz`` (of arrays, or sparse), HDF5.
-        key: Which array of an ``.npz`` or HDF5 file; None is the only one, or ``x``.
+        key: Which array of an ``.npz`` or HDF5 file; None is the only one, or ``x``, or all of an ``.npz`` whose
+            arrays are columns, as it is written for tables.
 
     Raises:
         UserError: The file does not exist, is damaged, ends in the middle, or is of another kind.
@@ -202,6 +203,10 @@ def _npz(path: Path, key: str | None) -> Opened:
             from scipy.sparse import load_npz
 
             return of_array(load_npz(path).tocsr())
+        if key is None and len(names) > 1 and not {"x", "X"} & set(names):
+            columns = {name: file[name] for name in names}
+            if all(column.ndim == 1 for column in columns.values()) and len({*map(len, columns.values())}) == 1:
+                return of_frame(pa.table({name: pa.array(column) for name, column in columns.items()}))
         return of_array(file[_chosen(names, key, path)])
 
 
@@ -209,7 +214,12 @@ def _chosen(names: list[str], key: str | None, path: Path) -> str:
     if key is None:
         key = next((name for name in names if len(names) == 1 or name.lower() == "x"), None)
     if key not in names:
-        raise UserError(f"{path} holds the arrays {', '.join(names)}: choose one by data=arrays data.key=NAME.")
+        meant = (
+            "x, or choose one in training by data=arrays data.key=NAME"
+            if key is None
+            else f"{key}, as in training"
+        )
+        raise UserError(f"{path} holds the arrays {', '.join(names)}: call the one that is meant {meant}.")
     return key
 
 

@@ -45,12 +45,14 @@ class TableSchema:
         label: The classes, None without labels.
         weight: Name of the column of weights, None without.
         named: Whether the columns have names of their own; those of arrays are numbered.
+        key: Which array of a file of several is read; None is the only one, or ``x``.
     """
 
     columns: tuple[Column, ...]
     label: Category | None = None
     weight: str | None = None
     named: bool = True
+    key: str | None = None
 
     @cached_property
     def of_sites(self) -> tuple[Column, ...]:
@@ -160,7 +162,8 @@ class TableSchema:
         """Plain values, from which :meth:`from_json` makes the schema again."""
         label = None if self.label is None else self.label.as_json()
         columns = [column.as_json() for column in self.columns]
-        return {"data": "table", "named": self.named, "label": label, "weight": self.weight, "columns": columns}
+        own = {"data": "table", "named": self.named, "label": label, "weight": self.weight, "columns": columns}
+        return own if self.key is None else {**own, "key": self.key}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "TableSchema":
@@ -169,7 +172,7 @@ class TableSchema:
         found = None if label is None else column_of(label)
         assert found is None or isinstance(found, Category)
         columns = tuple(column_of(column) for column in content["columns"])
-        return cls(columns, found, content["weight"], content["named"])
+        return cls(columns, found, content["weight"], content["named"], content.get("key"))
 
     def _labels(self, batch: Any, names: set[str], file: str, first_row: int) -> NDArray[np.int64]:
         if self.label is None or self.label.name not in names:

@@ -147,6 +147,7 @@ class Table:
             split_seed=self.split_seed,
             picture=self.picture,
             schema=self.schema,
+            key=self.key,
         )
 
 
@@ -160,6 +161,7 @@ def table_data(
     split_seed: int = 0,
     picture: tuple[int, int] | None = None,
     schema: TableSchema | None = None,
+    key: str | None = None,
 ) -> TableData:
     """Find the columns of a table in one pass over its rows, and make numbers of them in another one.
 
@@ -175,6 +177,7 @@ def table_data(
         split_seed: Seed of that split.
         picture: Height and width, where the columns are pixels.
         schema: What the columns are; None finds it out.
+        key: Of the array in files of several, for the schema.
     """
     further, given = further or {}, _named(columns)
     order, n_test = None, 0
@@ -185,7 +188,7 @@ def table_data(
     summaries, n, named = _summaries(begin(), name, ignore, trained)
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
-        schema, ignored = TableSchema(tuple(found.columns), found.label, found.weight, named), found.ignored
+        schema, ignored = TableSchema(tuple(found.columns), found.label, found.weight, named, key), found.ignored
     else:
         ignored = _besides(schema, [summary.name for summary in summaries])
     apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
@@ -231,9 +234,9 @@ LABEL = "label"
 """Name of a column of classes that are given beside a table."""
 
 
-def read_rows(path: Path, schema: TableSchema, *, complete: bool = True, key: str | None = None) -> Rows:
+def read_rows(path: Path, schema: TableSchema, *, complete: bool = True) -> Rows:
     """Rows of a file as numbers of the units of a schema; columns may be missing unless ``complete``."""
-    return _whole(opened(path, key=key), str(path), schema, complete=complete)
+    return _whole(opened(path, key=schema.key), str(path), schema, complete=complete)
 
 
 def _besides(schema: TableSchema, names: list[str]) -> dict[str, str]:

@@ -1,17 +1,22 @@
 """A table with its empty cells filled is the same table: columns, order, texts and types."""
 
+import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 import torch
 from pyarrow import parquet
 
+from memcomp_lightning import rng
+from memcomp_lightning.data import PixelLayout, Table
+from memcomp_lightning.data.schema import ImageSchema
 from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.data.tables.filled import filled
-from memcomp_lightning.data.written import write_columns
+from memcomp_lightning.data.written import in_one_array, write_columns
 from memcomp_lightning.errors import UserError
 
 SCHEMA = TableSchema(
@@ -67,6 +72,44 @@ def test_types_stay(tmp_path: Path, cells: dict[str, Any], expected: list[Any]) 
     written = parquet.read_table(tmp_path / "out.parquet").column(next(iter(cells))).to_pylist()
     assert written == expected
     assert [type(cell) for cell in written] == [type(cell) for cell in expected]
+
+
+def test_arrays_and_pictures_come_back_from_the_file_that_is_written(tmp_path: Path) -> None:
+    pixels = rng.numpy_stream(0, "pixels").random((20, 2, 3)).round(3)
+    np.savez(tmp_path / "in.npz", other=np.zeros(3), rows=pixels)
+    schema = Table(path=str(tmp_path / "in.npz"), columns="probability", key="rows").load().schema
+    schema = TableSchema.from_json(json.loads(json.dumps(schema.as_json())))  # as a run keeps it
+    pictures = ImageSchema(PixelLayout(2, 3), 0)
+    some = pixels.copy()
+    some[3, 1, 1] = np.nan
+    np.savez(tmp_path / "gaps.npz", other=np.zeros(3), rows=some, x=some)
+    v = torch.tensor(pixels.reshape(20, 6), dtype=torch.float32)
+    for own, columns in (
+        (schema, schema.filled(tmp_path / "gaps.npz", v)),
+        (pictures, pictures.decode(v)),
+        (ImageSchema(PixelLayout(3, 3, (0, 1, 2, 3, 5, 8)), 0), pictures.decode(v)),
+    ):
+        write_columns(in_one_array(columns, own, tmp_path / "out.npz"), tmp_path / "out.npz", overwrite=True)
+        torch.testing.assert_close(own.read(tmp_path / "out.npz").v, v)
+        again = Table(path=str(tmp_path / "out.npz"), columns="probability").load()  # as data=arrays reads them
+        assert not again.schema.named
+        assert again.train.n + again.test.n == 20
+
+
+def test_an_npz_of_columns_is_a_table(tmp_path: Path) -> None:
+    columns = {
+        "age": np.array([30, 41, 22]),
+        "colour": np.array(["red", None, "blue"], dtype=object),
+        "height": np.array([170.0, np.nan, 180.0]),
+    }
+    write_columns(columns, tmp_path / "out.npz")
+    rows = SCHEMA.read(tmp_path / "out.npz", complete=False)
+    known = rows.v.masked_fill(~rows.observed, torch.nan)  # type: ignore[operator]
+    expected = [[torch.nan, 1, 0, 0], [torch.nan, torch.nan, 1.1, torch.nan], [torch.nan, 0, -0.8, 1]]
+    torch.testing.assert_close(known, torch.tensor(expected), equal_nan=True)
+    np.savez(tmp_path / "odd.npz", a=np.zeros(3), b=np.zeros(4))
+    with pytest.raises(UserError, match="holds the arrays a, b: call the one that is meant x, or choose"):
+        SCHEMA.read(tmp_path / "odd.npz")
 
 
 def test_a_file_that_has_changed_is_refused(tmp_path: Path) -> None:
