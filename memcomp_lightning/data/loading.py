@@ -156,18 +156,25 @@ class Batches:
         self._resume: dict[str, int] | None = None
 
     def repeated(self, seeds: Sequence[int]) -> "Batches":
-        """Return the same images once for each seed, in the order of that seed, on one replica axis."""
+        """Return the same images once for each seed, in the order of that seed, on one replica axis.
+
+        Raises:
+            SettingError: Images with weights come in chunks, whose shares of a step would hang on the seed.
+        """
         require(len(seeds) > 0, "seeds", list(seeds), "at least one seed")
-        if isinstance(self._v, SparseRows) or self._weight is not None:
-            raise ValueError(
-                "images in sparse rows, or with weights, have no replica axis: they are not repeated."
-            )
+        if isinstance(self._v, SparseRows):
+            raise ValueError("images in sparse rows have no replica axis: they are not repeated.")
+        whole = self._world_size == 1 and all(chunk.closes_step for chunk in self._chunks)
+        fits = self._weight is None or len(seeds) == 1 or whole
+        allowed = "one seed for images with weights, or chunks that are whole steps"
+        require(fits, "seeds", list(seeds), allowed, "Raise chunk_size.")
         repeated = copy.copy(self)
         repeated._seeds = tuple(seeds)
         repeated._replicas = (len(seeds) * math.prod(self._replicas),)
         if not self._shuffle:
             n, units = self._label.shape[-1], self._v.shape[-1]
             repeated._label = self._label.reshape(-1, n).repeat(len(seeds), 1)
+            repeated._weight = None if self._weight is None else self._weight.repeat(len(seeds), 1)
             if self._at is not None:
                 repeated._at = self._at.reshape(-1, n).repeat(len(seeds), 1)
                 return repeated
@@ -242,8 +249,8 @@ class Batches:
         if self._weight is None:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
         weights = self._weight if order is None else self._weight[order]
-        weight = weights[positions]
-        share = self._world_size * float(weight.sum()) / float(weights[chunk.step].sum())
+        weight, of_step = weights[..., positions], weights[..., chunk.step]
+        share = self._world_size * float(weight.sum()) / float(of_step.sum())  # alike for all seeds
         return Batch(v, label, share, chunk.closes_step, weight, observed)
 
     def _labels(self, positions: slice, index: Tensor | None) -> Tensor:

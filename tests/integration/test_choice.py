@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running import FAST, Outcome
+from running import FAST, QUIET, Outcome
 
 Run = Callable[..., Outcome]
 RATES = "choose={setting:finetune.optimizer.lr,values:[1e-9,0.5]}"
@@ -26,6 +26,15 @@ def test_the_run_is_the_one_with_the_chosen_value(memcomp_train: Run) -> None:
     assert chosen["test_loss"] == found("given")["test_loss"]
     assert chosen["choice"]["values"] == [1e-9, 0.5]
     assert chosen["choice"]["accuracies"][1] > chosen["choice"]["accuracies"][0]
+
+
+def test_rows_with_weights_choose_as_all_others_do(memcomp_train: Run) -> None:
+    rows = "".join(f"{k % 5 + 0.5},{'ab'[k % 2]},{1 + k % 3}\n" for k in range(60))
+    Path("rows.csv").write_text(f"x,kind,w\n{rows}")
+    table = ["data=table", "data.path=rows.csv", "data.columns={label: kind, weight: w}", *QUIET]
+    outcome = memcomp_train(*table, RATES, "pretrain.iterations=1", "finetune.iterations=3", "hydra.run.dir=run")
+    assert outcome.status == 0, outcome.err
+    assert found("run")["choice"]["values"] == [1e-9, 0.5]
 
 
 def test_lengths_of_training_can_be_chosen(memcomp_train: Run) -> None:

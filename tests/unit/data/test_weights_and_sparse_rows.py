@@ -61,6 +61,20 @@ def test_shares_add_up_to_the_weighted_mean_of_a_step(chunk_size, world_size):
     torch.testing.assert_close(total, (weight.unsqueeze(-1) * v).sum(0) / weight.sum())
 
 
+@pytest.mark.parametrize(("batch_size", "chunk_size"), [(None, 9), (3, 9), (3, 2)])
+def test_weights_go_with_their_images_in_the_order_of_each_seed(batch_size, chunk_size):
+    weight, label = torch.tensor([1.0, 2.0, 0.5, 4.0, 1.0, 3.0]), torch.arange(6)
+    batches = [Batches(images(6), label, batch_size, chunk_size, True, seed, weight=weight) for seed in (0, 4)]
+    seeds = [4] if chunk_size == 2 else [0, 4]
+    for alone, together in zip(batches[1], batches[0].repeated(seeds), strict=True):
+        assert together.weight.equal(weight[together.label])
+        assert together.weight[-1].equal(alone.weight)
+        assert together.share == pytest.approx(alone.share)
+    if chunk_size == 2:
+        with pytest.raises(SettingError, match="one seed for images with weights"):
+            batches[0].repeated([0, 4])
+
+
 @pytest.mark.parametrize(
     ("weight", "message"), [(torch.ones(3), "weight.shape"), (torch.tensor([1.0, 0.0]), "weight = 0.0")]
 )
