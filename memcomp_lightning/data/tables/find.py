@@ -33,11 +33,10 @@ class Summary:
         n_numbers: Cells that are numbers.
         odd: The first cell that is no number, and its row from 1; None where there is none.
         distinct: Different cells, None where they are more than a thousand.
-        low, high: Least and largest number.
         n_known: Cells of training rows that are not empty.
         mean, squares: Of the numbers in training rows: mean, and sum of squared deviations.
         varies: Whether the numbers in training rows differ.
-        whole: Whether all numbers are whole.
+        uneven: The first number that is not whole, as it stands, and its row from 1; None where there is none.
         counts: Whether the numbers go up by one from row to row.
     """
 
@@ -47,13 +46,11 @@ class Summary:
     n_numbers: int = 0
     odd: tuple[int, str] | None = None
     distinct: set[Any] | None = field(default_factory=set)
-    low: float = math.inf
-    high: float = -math.inf
     n_known: int = 0
     mean: float = 0.0
     squares: float = 0.0
     varies: bool = False
-    whole: bool = True
+    uneven: tuple[int, str] | None = None
     counts: bool = True
     _first: float = math.nan
     _some: float = math.nan
@@ -76,21 +73,22 @@ class Summary:
                 self.distinct = None
         known = ~empty if trained is None else ~empty & trained
         if self.odd is None:
-            self._add_numbers(cells.numbers(), empty, known)
+            numbers = cells.numbers()
+            uneven = ~empty & (numbers != np.round(numbers))
+            if self.uneven is None and uneven.any():
+                at = int(uneven.argmax())
+                self.uneven = self.n + at + 1, str(cells.array[at].as_py())
+            self._add_numbers(numbers, known)
         self.n_known += int(known.sum())
         self.n_numbers += int(spelt.sum())
         self.n_empty += int(empty.sum())
         self.n += len(empty)
 
-    def _add_numbers(self, numbers: Any, empty: Any, known: Any) -> None:
+    def _add_numbers(self, numbers: Any, known: Any) -> None:
         if math.isnan(self._first):
             self._first = float(numbers[0]) - self.n
         in_turn = numbers == self._first + self.n + np.arange(len(numbers))
         self.counts = self.counts and self._first.is_integer() and bool(in_turn.all())
-        x = numbers[~empty]
-        if len(x):
-            self.low, self.high = min(self.low, float(x.min())), max(self.high, float(x.max()))
-            self.whole = self.whole and bool((x == np.round(x)).all())
         x = numbers[known]
         if not len(x):
             return
@@ -101,6 +99,11 @@ class Summary:
         change = mean - self.mean
         self.mean += change * m / (n + m)
         self.squares += float(np.square(x - mean).sum()) + change**2 * n * m / (n + m)
+
+    @property
+    def whole(self) -> bool:
+        """Whether all numbers are whole."""
+        return self.uneven is None
 
     @property
     def deviation(self) -> float:
@@ -271,8 +274,7 @@ def _of_all(summaries: Sequence[Summary], file: str) -> Summary:
             whole.distinct = None if joined is None or len(joined) > _KEPT else joined
         whole.n, whole.n_empty = whole.n + summary.n, whole.n_empty + summary.n_empty
         whole.n_numbers += summary.n_numbers
-        whole.whole = whole.whole and summary.whole
-        whole.low, whole.high = min(whole.low, summary.low), max(whole.high, summary.high)
+        whole.uneven = whole.uneven or summary.uneven
     return whole
 
 
@@ -296,10 +298,10 @@ def _shared(summary: Summary, common: Summary, file: str) -> Column:
 def _classes(summary: Summary, file: str) -> Category:
     """The classes of a column of labels; -1 is no class, unless -1 and 1 are all that there is."""
     place = f"{file}, label {summary.name!r}"
-    if summary.odd is None and not summary.whole:
+    if summary.odd is None and summary.uneven is not None:
+        row, cell = summary.uneven
         raise UserError(
-            f"{place} has numbers that are not whole, from {summary.low:g} to {summary.high:g}: classes are words "
-            "or whole numbers."
+            f"{file}, column {summary.name!r}, row {row}: {cell!r} is no class: expected words or whole numbers."
         )
     if summary.distinct is None:
         raise UserError(f"{place} has more than {_KEPT} different values: too many for classes.")

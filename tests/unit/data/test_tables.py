@@ -340,9 +340,9 @@ REFUSED: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "one name twice": ("x,x,z\n" + ROWS, {}, "two columns of the name 'x'"),
     "no UTF-8": (HEADED.encode("utf-16"), {}, "not text in UTF-8"),
     "label in between": (
-        HEADED,
-        {"columns": {"label": "x"}},
-        "label 'x' has numbers that are not whole, from 0.5",
+        "k,y\n" + "1,a\n2,b\n" * 9 + ",a\n1.5,b\n2,a\n",
+        {"columns": {"label": "k"}},
+        "table.csv, column 'k', row 20: '1.5' is no class: expected words or whole numbers",
     ),
     "no such column": (
         HEADED,
