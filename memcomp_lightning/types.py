@@ -9,6 +9,9 @@ from torch import Tensor
 
 StateT = TypeVar("StateT")
 
+UNLABELLED = -1
+"""The class of a row that has none."""
+
 
 class Configurations(NamedTuple):
     """Joint states of visible and hidden units.
@@ -48,7 +51,7 @@ class Batch(NamedTuple):
 
     Attributes:
         v: Values of the visible units, for pictures intensities in [0, 1], ``(*replicas, n, n_visible)``.
-        label: Class indices (int64), ``(*replicas, n)``.
+        label: Class indices (int64), ``(*replicas, n)``; :data:`UNLABELLED` where there is none.
         share: ``n_processes * n / n_step``, where ``n_step`` counts the images of the step over all its
             chunks and processes, each by its weight. The gradient of ``share * mean over this batch``, summed
             over the chunks and averaged over the processes, is the gradient of the mean over the step's images.

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-UNLABELLED = -1
-"""The class of a row that has none."""
+from memcomp_lightning.types import UNLABELLED as UNLABELLED  # for all that reads rows
 
 
 class Rows(NamedTuple):

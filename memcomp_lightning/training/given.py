@@ -8,13 +8,10 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.units import Units
-from memcomp_lightning.types import Batch
+from memcomp_lightning.types import UNLABELLED, Batch
 
 Given: TypeAlias = "Batch | Tensor | Sequence[Tensor]"
 """A batch; or values of the visible units; or these and class indices, as data loaders of tensors have them."""
-
-UNKNOWN = -1
-"""The class of rows that come without labels."""
 
 
 def as_batch(given: Given, units: Units | None = None) -> Batch:
@@ -49,7 +46,9 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
             observed = None if observed is None else units.over_sites(observed)
         require(v.shape[-1] == units.n, "columns of a batch", v.shape[-1], f"{units.n}, the visible units")
         units.check(v, observed)
-    label = parts[1] if len(parts) == 2 else torch.full(v.shape[:-1], UNKNOWN, dtype=torch.long, device=v.device)
+    label = (
+        torch.full(v.shape[:-1], UNLABELLED, dtype=torch.long, device=v.device) if len(parts) == 1 else parts[1]
+    )
     return Batch(v, label, share=1.0, closes_step=True, observed=observed)
 
 
