@@ -187,7 +187,8 @@ def find(summaries: Sequence[Summary], given: Mapping[str, str], file: str, *, u
         columns.append(_column(summary, kind, file))
     if not columns:
         raise UserError(f"{file}: no column is left for the model. {_typed('NAME', 'real')}")
-    return Found(columns, None if label is None else _classes(by_name[label], file), roles.get("weight"), ignored)
+    classes = None if label is None else _classes(by_name[label], file, given.get(label))
+    return Found(columns, classes, roles.get("weight"), ignored)
 
 
 def _typed(name: str, kind: str) -> str:
@@ -295,8 +296,16 @@ def _shared(summary: Summary, common: Summary, file: str) -> Column:
     )
 
 
-def _classes(summary: Summary, file: str) -> Category:
-    """The classes of a column of labels; -1 is no class, unless -1 and 1 are all that there is."""
+def _classes(summary: Summary, file: str, kind: str | None) -> Category:
+    """The classes of a column of labels.
+
+    -1 is no class, unless the column is called a category beside, or -1 and 1 are all that there is.
+    """
+    if kind not in (None, "category", summary.name):
+        allowed = "category, where -1 is a class, or nothing"
+        raise UserError(
+            f"data.columns: {summary.name}: {kind} is not allowed: it is the label: expected {allowed}."
+        )
     place = f"{file}, label {summary.name!r}"
     if summary.odd is None and summary.uneven is not None:
         row, cell = summary.uneven
@@ -306,7 +315,7 @@ def _classes(summary: Summary, file: str) -> Category:
     if summary.distinct is None:
         raise UserError(f"{place} has more than {_KEPT} different values: too many for classes.")
     words = tuple(summary.words)
-    if words != (-1, 1):
+    if words != (-1, 1) and kind != "category":
         words = tuple(word for word in words if word not in (-1, "-1"))
     if len(words) < 2:
         raise UserError(f"{place} has {len(words)} classes, expected two or more. Leave the label out.")

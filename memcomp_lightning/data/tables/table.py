@@ -37,6 +37,7 @@ class TableData:
         name: Of the data, for reports.
         layout: Where the columns lie in a picture; None where they are none.
         ignored: Why each column that the model does not have is left out.
+        minus_one: Rows of the file without a label because theirs is -1.
     """
 
     train: Rows
@@ -46,6 +47,7 @@ class TableData:
     name: str
     layout: PixelLayout | None = None
     ignored: Mapping[str, str] = field(default_factory=dict)
+    minus_one: int = 0
 
     @property
     def n_classes(self) -> int:
@@ -66,8 +68,16 @@ class TableData:
         lines = [(column.name, column.kind, column.described) for column in self.schema.columns]
         if self.schema.label is not None:
             n_without = int((self.train.label == UNLABELLED).sum())
-            words = self.schema.label.described + (f"; {n_without:,} training rows have none" if n_without else "")
-            lines.append((self.schema.label.name, "label", words))
+            name, words = self.schema.label.name, self.schema.label.described
+            if n_without:
+                words += f"; {n_without:,} training rows have none"
+            if self.minus_one:
+                typed = f"data.columns={{label: {name}, {name}: category}}"
+                keep = f"{typed if name != LABEL else 'another word'} makes a class of it"
+                words += f"; -1 is none, in {self.minus_one:,} rows: {keep}"
+            elif self.schema.label.words[0] in (-1, "-1"):
+                words += "; -1 is a class"
+            lines.append((name, "label", words))
         if self.schema.weight is not None:
             lines.append((self.schema.weight, "weight", ""))
         lines += [(name, "ignored", reason) for name, reason in self.ignored.items()]
@@ -195,7 +205,15 @@ def table_data(
     layout = None if picture is None else _layout(picture, schema)
     parts = _split(begin(), name, schema, [n - n_test, n_test], order)
     train, test = parts[0], apart.get("test", parts[1])
-    return TableData(train, test, apart.get("validation"), schema, name, layout, ignored)
+    minus_one = _minus_one(summaries, parts, schema)
+    return TableData(train, test, apart.get("validation"), schema, name, layout, ignored, minus_one)
+
+
+def _minus_one(summaries: list[Summary], parts: list[Rows], schema: TableSchema) -> int:
+    """Rows without a label whose cell is not empty."""
+    name = None if schema.label is None else schema.label.name
+    empty = next((summary.n_empty for summary in summaries if summary.name == name), None)
+    return 0 if empty is None else sum(int((part.label == UNLABELLED).sum()) for part in parts) - empty
 
 
 def _order(n: int, name: str, test_fraction: float, split_seed: int) -> tuple[NDArray[np.int64], int]:
@@ -381,6 +399,7 @@ def _table(lines: list[tuple[str, str, str]], data: TableData) -> str:
         kinds = [kind for _, kind, _ in lines]
         by_kind = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
         rows = [f"  {len(lines)} columns: {by_kind}"]
+        rows += [f"  {name}  {kind}  {text}" for name, kind, text in lines if kind == "label"]
     else:
         wide = [max(len(line[k]) for line in lines) for k in range(2)]
         rows = [f"  {name:<{wide[0]}}  {kind:<{wide[1]}}  {text}".rstrip() for name, kind, text in lines]

@@ -187,6 +187,25 @@ def test_minus_one_is_no_label(tmp_path: Path) -> None:
     data = Table(path=written(tmp_path, text), columns={"label": "k"}).load()
     assert data.schema.class_names == ["0", "1"]
     assert sorted(set(torch.cat((data.train.label, data.test.label)).tolist())) == [-1, 0, 1]
+    assert "10 training rows have none; -1 is none, in 10 rows" in data.described()
+    assert "data.columns={label: k, k: category} makes a class of it" in data.described()
+
+
+@pytest.mark.parametrize(
+    ("labels", "columns", "classes"),
+    [
+        ([-1, 0, 1], {"label": "k", "k": "category"}, ["-1", "0", "1"]),
+        ([-1, 1, ""], {"label": "k"}, ["-1", "1"]),
+        (["-1", "up", "up"], {"label": "k", "k": "category"}, ["-1", "up"]),
+    ],
+)
+def test_minus_one_is_a_class(tmp_path: Path, labels: list[Any], columns: dict[str, str], classes: Any) -> None:
+    text = "x,k\n" + "".join(f"{i * 0.3},{labels[i % 3]}\n" for i in range(30))
+    data = Table(path=written(tmp_path, text), columns=columns).load()
+    assert data.schema.class_names == classes
+    assert int((torch.cat((data.train.label, data.test.label)) == -1).sum()) == 10 * labels.count("")
+    assert "; -1 is a class" in data.described()
+    assert data.minus_one == 0
 
 
 def test_each_row_is_in_one_part(tmp_path: Path) -> None:
@@ -284,6 +303,9 @@ def test_an_array_with_labels_and_gaps() -> None:
     assert module.train_observed is not None
     labels = torch.cat((module.train[1], module.test[1]))
     assert torch.bincount(labels + 1).tolist() == [10, 10, 20]
+    assert (
+        "label  0, 1; 6 training rows have none; -1 is none, in 10 rows: another word makes a" in module.described
+    )
 
 
 def test_a_label_for_each_row() -> None:
@@ -343,6 +365,11 @@ REFUSED: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
         "k,y\n" + "1,a\n2,b\n" * 9 + ",a\n1.5,b\n2,a\n",
         {"columns": {"label": "k"}},
         "table.csv, column 'k', row 20: '1.5' is no class: expected words or whole numbers",
+    ),
+    "a label that is real": (
+        HEADED,
+        {"columns": {"label": "z", "z": "real"}},
+        "z: real is not allowed: it is the label",
     ),
     "no such column": (
         HEADED,
