@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import re
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_together
 from memcomp_lightning.modules import CheckpointError
+from memcomp_lightning.trained.alone import LoadWarning
 
 T = TypeVar("T")
 
@@ -113,7 +115,11 @@ def carry_out(
         return
     try:
         places, settings = usage.read(typed)
-        with written_together():
+        with written_together(), warnings.catch_warnings():
+            warnings.simplefilter("always", LoadWarning)
+            warnings.showwarning = lambda message, *_, **__: say(
+                f"{usage.command}: warning: {message}", error=True
+            )
             act(places, settings)
     except (UserError, SettingError, CheckpointError, OSError) as error:
         refuse(usage.command, UserError(in_words(error)))

@@ -4,18 +4,19 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from memcomp_lightning.configuration.plans import Shape, classifier_of, network_of, units_of_settings
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
-from memcomp_lightning.errors import UserError, require, require_choice, require_count
+from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
-from memcomp_lightning.modules.weights import check_fits, read_checkpoint
 from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.trained.alone import network_of as network_alone
+from memcomp_lightning.trained.alone import one_of, replica_of, schema_in, taken, tensors_of, warn
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +24,7 @@ class Run:
     """What a training left, to be used.
 
     Attributes:
-        path: The run folder, or the weight file.
+        path: The run folder, or the file.
         network: What was pretrained: an RBM, a Boltzmann machine, a DBN or DBM.
         classifier: The fine-tuned network, which maps values of the visible units to logits; None without one.
         schema: What the visible units stand for; None of a weight file without its run folder.
@@ -67,8 +68,8 @@ class Run:
         """Raise a UserError unless the network has trained weights."""
         if not self.pretrained:
             raise UserError(
-                f"{self.path} was not pretrained: it has a classifier alone, and no model of the data. Train with "
-                "pretrain.iterations=20, say."
+                f"{self.path} was not pretrained: it has a classifier alone, and no model of the data. "
+                + ("Name its run folder." if self.path.is_file() else "Train with pretrain.iterations=20, say.")
             )
 
     @property
@@ -87,7 +88,7 @@ class Run:
         if self.schema is None:
             raise UserError(
                 f"{self.path} is a weight file alone, which does not say what its units stand for: name the run "
-                "folder, where schema.json does."
+                "folder, or give schema=FILE, the schema.json of that folder."
             )
         return self.schema
 
@@ -96,18 +97,24 @@ def load(
     path: str | Path,
     *,
     network: nn.Module | None = None,
+    schema: Schema | str | Path | None = None,
     replica: int | None = None,
     trusted: Collection[str] = (),
 ) -> Run:
-    """Read a run folder, or a weight file.
+    """Read a run folder, a weight file or a checkpoint.
 
     No data are read, and no code but this package's runs: settings that name other code are refused.
 
+    A :class:`~memcomp_lightning.trained.alone.LoadWarning` says what was assumed: which of several networks was
+    taken, units that a file does not name, a run that has not finished.
+
     Args:
-        path: A run folder of ``memcomp-train``, a file of its folder ``weights``, or a ``.safetensors`` file of
-            ``memcomp-export``.
-        network: Takes the weights of a file that lies by itself: an RBM, a DBN, any module. DBNs and RBMs of units
-            in {0, 1} follow from the tensors: leave it out.
+        path: A run folder of ``memcomp-train``, a file of its folders ``weights`` and ``checkpoints``, such a file
+            moved elsewhere, or a ``.safetensors`` file of ``memcomp-export``.
+        network: Takes the weights of a file that lies by itself: an RBM, a DBN, any module. DBNs, RBMs and
+            classifiers of hidden units in {0, 1} follow from the tensors: leave it out.
+        schema: What the visible units of a file that lies by itself stand for: a ``schema.json`` of the run
+            folder, or a schema. Without it there is a model, but no columns and words.
         replica: Which of several networks that were trained side by side (``data.partitions``), from 0.
         trusted: Packages of your own whose parts the settings may name: ``["your_package"]``.
 
@@ -116,25 +123,55 @@ def load(
     """
     path = Path(path)
     if path.is_dir():
+        _require_no_schema(schema, "a run folder has its own")
         return _of_folder(path, replica, trusted)
     if path.suffix == ".safetensors":
         from memcomp_lightning.trained.export.safetensors import read  # which makes runs
 
         require(network is None, "network", type(network).__name__, "None: such a file says which it holds")
         require(replica in (None, 0), "replica", replica, "0: such a file holds one network")
+        _require_no_schema(schema, "such a file has its own")
         return read(path)
-    beside = RunFolder(path.parent.parent)
-    if network is None and beside.overrides is not None and path.parent.name == "weights":
-        return _of_folder(beside.path, replica, trusted, file=path)
-    state = read_checkpoint(path)
-    if network is None:
-        network = _network_of_tensors(state, path)
-    check_fits(network, state, path)
-    network.load_state_dict(state)
-    return Run(path, network)
+    if network is None and schema is None and (place := _place_of(path)) is not None:
+        return _of_folder(place.folder, replica, trusted, place)
+    return _of_file(path, network, schema_in(Path(schema)) if isinstance(schema, str | Path) else schema, replica)
 
 
-def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, file: Path | None = None) -> Run:
+def _require_no_schema(schema: object, why: str) -> None:
+    require(schema is None, "schema", str(schema), f"none: {why}")
+
+
+class _Place(NamedTuple):
+    """Where a file lies in a run folder, and the stage that it is of."""
+
+    folder: Path
+    file: Path
+    stage: str
+
+
+def _place_of(path: Path) -> _Place | None:
+    """The place of a weight file or a checkpoint in its run folder; None of one that lies elsewhere."""
+    for folder, kind, stage in (
+        (path.parent.parent, path.parent.name, path.stem),
+        (path.parent.parent.parent, path.parent.parent.name, path.parent.name),
+    ):
+        fits = kind == ("weights" if path.suffix == ".pt" else "checkpoints")
+        if fits and stage in ("pretrain", "finetune") and RunFolder(folder).overrides is not None:
+            return _Place(folder, path, stage)
+    return None
+
+
+def _of_file(path: Path, network: nn.Module | None, schema: Schema | None, replica: int | None) -> Run:
+    """A file that lies by itself."""
+    state = tensors_of(path)
+    made = network_alone(state, path, schema) if network is None else network
+    taken(made, one_of(state, made.state_dict(), replica, path), path)
+    if network is None and isinstance(made, nn.Sequential):
+        return Run(path, made[0], made, schema, {}, pretrained=False)
+    return Run(path, made, None, schema, {})
+
+
+def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place: _Place | None = None) -> Run:
     folder, written = RunFolder(path), path / "settings.yaml"
     if folder.overrides is None or not written.is_file():
         raise UserError(f"{path} is no run folder of memcomp-train: it has no settings.yaml and overrides.json.")
@@ -152,31 +189,34 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], *, fil
     n_replicas = _n_replicas(config)
     if n_replicas is None:
         require(replica in (None, 0), "replica", replica, "0: this run has one network")
-    elif replica is not None:
-        require_count("replica", replica, 0)
-        require(replica < n_replicas, "replica", replica, f"an integer from 0 to {n_replicas - 1}")
+    else:
+        replica = replica_of(replica, n_replicas, path)
     config.data.partitions, config.data.first_partitions, config.model.weights = 1, None, None
     files = {name: folder.weights(name) for name in ("pretrain", "finetune")}
-    if file is not None:
-        require_choice("weight file", file.stem, tuple(files))
-    if file is not None and file.stem == "pretrain":
-        files = {"pretrain": file}
-    there = {name: where for name, where in files.items() if where.is_file()}
-    if not there:
-        raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}")
-    pairs, edges = read_checkpoint(next(iter(there.values()))).get("pairs"), config.model.get("connectivity")
+    if place is not None:
+        files = ({} if place.stage == "pretrain" else files) | {place.stage: place.file}
+    states = {name: tensors_of(where) for name, where in files.items() if where.is_file() or place is not None}
+    if not states:
+        begun = [folder.checkpoint(name) for name in files if folder.checkpoint(name).is_file()]
+        as_it_is = f", or name its checkpoint as it is, {begun[0]}" if begun else ""
+        raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}{as_it_is}")
+    if place is None and folder.result is None:
+        warn(
+            f"{path} has not finished: it has {' and '.join(states)} alone. Go on with memcomp-train resume={path}"
+        )
+    pairs, edges = next(iter(states.values())).get("pairs"), config.model.get("connectivity")
     if isinstance(pairs, Tensor) and isinstance(edges, DictConfig):
         # Its file may be elsewhere, and pictures are not known here. It joins sites, pairs are of their entries.
         config.model.connectivity = _units_of(config, schema).site_of()[pairs].unique(dim=0).tolist()
     network, classifier = _network(config, schema), None
-    if "pretrain" in there:
-        _take(network, there["pretrain"], n_replicas, replica)
-    if "finetune" in there:
+    if "pretrain" in states:
+        _take(network, states["pretrain"], files["pretrain"], replica)
+    if "finetune" in states:
         # On a network of its own: the energy model keeps the weights of its pretraining.
         classifier = classifier_of(config, _network(config, schema), schema.n_classes).network.eval()
-        _take(classifier, there["finetune"], n_replicas, replica)
+        _take(classifier, states["finetune"], files["finetune"], replica)
     settings = cast(dict[str, Any], OmegaConf.to_container(config))
-    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in there)
+    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states)
 
 
 _OWN = ("memcomp_lightning.", "torch.optim.")
@@ -222,33 +262,6 @@ def _n_replicas(config: DictConfig) -> int | None:
     return min(n, config.data.first_partitions or n) if n > 1 else None
 
 
-def _take(module: nn.Module, path: Path, n_replicas: int | None, replica: int | None) -> None:
-    """Load a weight file, of several replicas that of one."""
-    state = read_checkpoint(path)
-    if n_replicas is not None:
-        own, at = module.state_dict(), replica or 0
-        state = {
-            name: x[at] if name in own and x.shape == (n_replicas, *own[name].shape) else x
-            for name, x in state.items()
-        }
-    check_fits(module, state, path)
-    module.load_state_dict(state)
-
-
-def _network_of_tensors(state: Mapping[str, Any], path: Path) -> nn.Module:
-    """An RBM or DBN of units in {0, 1}, as its tensors say."""
-    from memcomp_lightning.models import RBM
-
-    weights = {name: x for name, x in state.items() if isinstance(x, Tensor) and name.endswith("weight")}
-    if set(state) == {"weight", "b", "c"} and state["weight"].ndim == 2:
-        n_hidden, n_visible = state["weight"].shape
-        return RBM(n_visible, n_hidden)
-    names = {f"rbms.{layer}.{part}" for layer in range(len(weights)) for part in ("weight", "b", "c")}
-    if set(state) == names and all(x.ndim == 2 for x in weights.values()):
-        sizes = [state[f"rbms.{layer}.weight"].shape for layer in range(len(weights))]
-        return DBN(sizes[0][1], [n_hidden for n_hidden, _ in sizes])
-    held = ", ".join(sorted(state)[:6])
-    raise UserError(
-        f"{path} lies by itself and holds {held}: the kinds of its units do not follow from them. Name its run "
-        "folder, or in Python give the network: load(PATH, network=RBM(...))."
-    )
+def _take(module: nn.Module, state: dict[str, Tensor], path: Path, replica: int | None) -> None:
+    """Load tensors, of several replicas those of one."""
+    taken(module, one_of(state, module.state_dict(), replica, path), path)

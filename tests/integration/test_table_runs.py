@@ -15,6 +15,7 @@ import memcomp_lightning
 from memcomp_lightning.configuration import plans
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import RBM
+from memcomp_lightning.trained import LoadWarning
 
 pytest.importorskip("pyarrow")
 
@@ -96,7 +97,8 @@ def test_weights_by_themselves(folder: Path, tmp_path: Path) -> None:
         memcomp_lightning.load(tmp_path)
     bits = RBM(5, 3)
     torch.save(bits.state_dict(), alone)
-    found = memcomp_lightning.load(alone)
+    with pytest.warns(LoadWarning, match="its visible and hidden units are taken for bits"):
+        found = memcomp_lightning.load(alone)
     assert torch.equal(found.model.c, bits.c)
     with pytest.raises(UserError, match="a weight file alone, which does not say what its units stand for"):
         _ = found.needed_schema

@@ -21,6 +21,7 @@ class Settings:
             one, else the features; safetensors, rbms and couplings hold the model.
         overwrite: Whether a file that is there is replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "model.safetensors"
@@ -28,6 +29,7 @@ class Settings:
     what: str | None = None
     overwrite: bool = False
     replica: int | None = None
+    schema: str | None = None
 
 
 USAGE = Usage(
@@ -53,7 +55,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Export a run."""
     output, what, overwrite = Path(settings.output), settings.what, settings.overwrite
     format = check_export(output, format=settings.format, what=what, overwrite=overwrite)
-    run = load(places[0], replica=settings.replica)
+    run = load(places[0], replica=settings.replica, schema=settings.schema)
     written = export(run, output, format=format, what=what, overwrite=overwrite)
     say(f"{output}: {written.holds}")
     for name in ("inputs", "outputs", "check", "use"):

@@ -35,6 +35,7 @@ class Settings:
         sweeps: Sweeps of the last round of these chains at most.
         overwrite: Whether files that are there are replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "filled.csv"
@@ -46,6 +47,7 @@ class Settings:
     sweeps: int = 1600
     overwrite: bool = False
     replica: int | None = None
+    schema: str | None = None
 
 
 USAGE = Usage(
@@ -75,7 +77,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
         raise UserError(f"probabilities={gaps}: the completed table goes there. Choose another file.")
     if settings.figures is not None:
         check_figures(Path(settings.figures), overwrite=settings.overwrite)
-    run, table = load(places[0], replica=settings.replica), existing(places[1])
+    run, table = load(places[0], replica=settings.replica, schema=settings.schema), existing(places[1])
     chains = MissingChains(n_chains=settings.chains, most_sweeps=settings.sweeps)
     rows = run.needed_schema.read(table, complete=False)
     found = impute(run, rows, m=settings.m, seed=settings.seed, chains=chains)

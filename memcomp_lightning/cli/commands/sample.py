@@ -40,6 +40,7 @@ class Settings:
         seed: Of all draws.
         overwrite: Whether files that are there are replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
         figure: A .png of the first 100, where rows are pictures.
         figures: Folder, .png or .pdf for figures of the rows beside those of data=TABLE.
         data: The table that figures compare with, say the one that was trained on.
@@ -54,6 +55,7 @@ class Settings:
     seed: int = 0
     overwrite: bool = False
     replica: int | None = None
+    schema: str | None = None
     figure: str | None = None
     figures: str | None = None
     data: str | None = None
@@ -84,7 +86,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Draw rows, and write them."""
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite)
-    run = load(places[0], replica=settings.replica)
+    run = load(places[0], replica=settings.replica, schema=settings.schema)
     schema = run.needed_schema
     _check_kind(output, schema)
     figure = None if settings.figure is None else _checked_figure(settings, schema)

@@ -30,6 +30,7 @@ class Settings:
         seed: Of what is drawn.
         overwrite: Whether a file that is there is replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "scores.csv"
@@ -40,6 +41,7 @@ class Settings:
     seed: int = 0
     overwrite: bool = False
     replica: int | None = None
+    schema: str | None = None
 
 
 USAGE = Usage(
@@ -60,7 +62,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     annealing = Annealing(
         n_chains=settings.chains, n_betas=min(Annealing().n_betas, settings.betas), most_betas=settings.betas
     )
-    run, table = load(places[0], replica=settings.replica), existing(places[1])
+    run, table = load(places[0], replica=settings.replica, schema=settings.schema), existing(places[1])
     rows = run.needed_schema.read(table, complete=False)
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
     if settings.figures is not None and "log_likelihood" not in found.columns:

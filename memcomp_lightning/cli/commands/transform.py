@@ -20,12 +20,14 @@ class Settings:
         overwrite: Whether a file that is there is replaced.
         layer: Hidden layer, from 1; null is the top one.
         replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "features.csv"
     overwrite: bool = False
     layer: int | None = None
     replica: int | None = None
+    schema: str | None = None
 
 
 USAGE = Usage(
@@ -41,7 +43,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Transform a file."""
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite, endings=TABLES)
-    run = load(places[0], replica=settings.replica)
+    run = load(places[0], replica=settings.replica, schema=settings.schema)
     found = transform(run, run.needed_schema.read(Path(places[1]), complete=False), layer=settings.layer)
     write_columns(found, output, overwrite=settings.overwrite)
     say(f"{len(next(iter(found.values()))):,} rows, {len(found)} features: {output}")

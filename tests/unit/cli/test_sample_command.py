@@ -36,7 +36,7 @@ def use(tmp_path, monkeypatch):
     """Let the command find a run of this schema and model, and work in an empty folder."""
 
     def use(schema, model):
-        monkeypatch.setattr(command, "load", lambda path, *, replica: Run(tmp_path, model, None, schema, {}))
+        monkeypatch.setattr(command, "load", lambda path, **_: Run(tmp_path, model, None, schema, {}))
         monkeypatch.chdir(tmp_path)
         return tmp_path
 
