@@ -16,10 +16,17 @@ from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.likelihood import log_likelihood_or_bound, log_pseudo_likelihood
 from memcomp_lightning.likelihood.missing import of_observed
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy
-from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.models import DBN, EnergyModel
 from memcomp_lightning.trained.partition import Annealing, LogZ, log_z_of
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import values
+from memcomp_lightning.training.filling import Filling
+from memcomp_lightning.types import Batch
+
+CLASS_DRAWS = 100
+"""Of what is missing of a row, over which its class probabilities are averaged."""
+
+_ROWS_AT_ONCE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +37,7 @@ class Scores:
         columns: ``row``, from 1, and what :func:`score` says.
         log_z: Log Z and how it was found; None where there is no likelihood.
         seconds: That it took to find it.
-        accuracy: Share of the labelled rows without gaps whose class is right; None without any.
+        accuracy: Share of the labelled rows that have a class whose class is right; None without any.
         notes: What was left out, and why, a sentence each.
     """
 
@@ -53,7 +60,9 @@ def score(
       error of log Z is one and the same for all rows.
     * ``free_energy``: F, so that ``log_likelihood`` is -F - log Z, in the units of the model.
     * ``pseudo_log_likelihood``: :math:`\sum_j \log p(v_j | v_{-j})`, which needs no log Z; NaN of rows with gaps.
-    * ``p(CLASS)`` and ``class`` of the fine-tuned network, if there is one; empty for rows with gaps.
+    * ``p(CLASS)`` and ``class`` of the fine-tuned network, if there is one. Rows with gaps have the mean over
+      :data:`CLASS_DRAWS` draws of what is missing, by the model of the data, as in training; they are empty where
+      the run has no such model.
 
     Args:
         run: A trained run.
@@ -90,12 +99,8 @@ def score(
             columns |= _pseudo_likelihoods(run, model, v, whole, notes)
     accuracy = None
     if run.classifier is not None:
-        of_classes, accuracy = _classes(run, rows, v, whole)
+        of_classes, accuracy = _classes(run, _Given(rows, v, observed, whole), notes, seed)
         columns |= of_classes
-        if not bool(whole.all()):
-            notes.append(
-                f"{int((~whole).sum()):,} rows with gaps have no class: fill them first, with memcomp-impute"
-            )
     return Scores(columns, log_z, seconds, accuracy, notes)
 
 
@@ -153,21 +158,57 @@ def _pseudo_likelihoods(run: Run, model: EnergyModel, v: Tensor, whole: Tensor, 
     return {"pseudo_log_likelihood": found.numpy()}
 
 
-def _classes(run: Run, rows: Rows, v: Tensor, whole: Tensor) -> tuple[Columns, float | None]:
+def _classes(run: Run, given: _Given, notes: list[str], seed: int) -> tuple[Columns, float | None]:
     """Probabilities of the classes, the likeliest one, and the share that is right."""
-    assert run.classifier is not None
-    names = run.needed_schema.class_names
+    rows, v, observed, whole = given
+    names, known = run.needed_schema.class_names, whole.clone()
     p = torch.full((len(v), len(names)), torch.nan)
     if bool(whole.any()):
-        some = v[whole].to(next(run.classifier.parameters()))
-        logits = torch.cat([run.classifier(part) for part in some.split(4096)]).float()
-        # By squared errors each class is learned by itself, and the outputs need not add up to one.
-        by_squares = (run.settings or {}).get("finetune", {}).get("loss") == "squared_error"
-        p[whole] = logits.sigmoid() if by_squares else torch.softmax(logits, dim=-1)
+        p[whole] = _probabilities(run, v[whole])
+    n_gaps, model = int((~whole).sum()), _of_data(run)
+    if n_gaps and observed is not None and model is not None:
+        p[~whole] = _mean_probabilities(run, model, v[~whole], observed[~whole], seed)
+        known[:] = True
+        notes.append(f"classes of {n_gaps:,} rows with gaps: means over {CLASS_DRAWS} draws of what is missing")
+    elif n_gaps:
+        notes.append(
+            f"{n_gaps:,} rows with gaps have no class: this run was not pretrained, so nothing fills them"
+        )
     best = p.argmax(-1)
     of_class = np.array([names[k] for k in best.tolist()], dtype=object)
-    of_class[~whole.numpy()] = None
+    of_class[~known.numpy()] = None
     columns: Columns = {f"p({name})": p[:, k].numpy() for k, name in enumerate(names)}
-    known = whole & (rows.label != UNLABELLED)
-    right = float((best == rows.label)[known].double().mean()) if bool(known.any()) else math.nan
+    judged = known & (rows.label != UNLABELLED)
+    right = float((best == rows.label)[judged].double().mean()) if bool(judged.any()) else math.nan
     return columns | {"class": of_class}, None if math.isnan(right) else right
+
+
+def _of_data(run: Run) -> EnergyModel | None:
+    """The model that draws what is missing of inputs: of a stack its first layer, or all if trained jointly."""
+    if not run.pretrained:
+        return None
+    if isinstance(run.network, DBN) and not run.trained_jointly:
+        return run.network[0]
+    return run.model
+
+
+def _probabilities(run: Run, v: Tensor) -> Tensor:
+    """Class probabilities of values without gaps, ``(n, n_classes)``."""
+    assert run.classifier is not None
+    some = v.to(next(run.classifier.parameters()))
+    logits = torch.cat([run.classifier(part) for part in some.split(4096)]).float()
+    # By squared errors each class is learned by itself, and the outputs need not add up to one.
+    by_squares = (run.settings or {}).get("finetune", {}).get("loss") == "squared_error"
+    return logits.sigmoid() if by_squares else torch.softmax(logits, dim=-1)
+
+
+def _mean_probabilities(run: Run, model: EnergyModel, v: Tensor, observed: Tensor, seed: int) -> Tensor:
+    """Their means over draws of what is missing."""
+    filling, generator = Filling(model), rng.stream(seed, "gaps of a classifier")
+    found = []
+    for some, known in zip(v.split(_ROWS_AT_ONCE), observed.split(_ROWS_AT_ONCE), strict=True):
+        many, masks = (part.repeat_interleave(CLASS_DRAWS, dim=0) for part in (some.to(model.b), known))
+        label = torch.full((len(many),), UNLABELLED, device="cpu")
+        drawn = filling.complete(Batch(many, label, 1.0, True, None, masks), generator).v
+        found.append(_probabilities(run, drawn).unflatten(0, (len(some), CLASS_DRAWS)).mean(1))
+    return torch.cat(found)

@@ -97,5 +97,5 @@ def _summary(found: Scores, settings: Settings) -> str:
                 "rows can still be compared with each other"
             )
     if found.accuracy is not None:
-        lines.append(f"accuracy on labelled rows without gaps: {found.accuracy:.4f}")
+        lines.append(f"accuracy on labelled rows: {found.accuracy:.4f}")
     return "\n".join([*lines, *found.notes])

@@ -157,6 +157,13 @@ def test_machines_have_scores_too(make: Any) -> None:
         assert of_rows[1] == pytest.approx(exact[1], abs=1e-5)
 
 
+def only_first(value: float) -> Rows:
+    """A row of which the first entry alone is known."""
+    v, observed = torch.zeros(1, 4), torch.zeros(1, 4, dtype=torch.bool)
+    v[0, 0], observed[0, 0] = value, True
+    return Rows(v, torch.tensor([-1]), observed)
+
+
 class Fixed(nn.Module):
     """Logits that follow the first two entries."""
 
@@ -175,10 +182,36 @@ def test_classes_are_those_of_the_classifier() -> None:
     assert found.columns["class"].tolist() == ["cat", "dog", "cat", "dog"]
     assert found.accuracy == pytest.approx(2 / 3)  # the last one has no label
     found = score(run_of(rbm(), classifier=Fixed()), rows(gaps=True))
+    assert found.notes == ["classes of 3 rows with gaps: means over 100 draws of what is missing"]
+    assert found.columns["p(cat)"] + found.columns["p(dog)"] == pytest.approx(1)
+    assert found.accuracy == pytest.approx(2 / 3)
+    # What the first two entries do not say, nobody need know; where nothing is known, the first is 1 as often as
+    # the model has it.
+    on = float(exact_log_likelihood(rbm(), only_first(1.0)).exp())
+    assert found.columns["p(cat)"] == pytest.approx([p, 1 - p, p, p * on + (1 - p) * (1 - on)], abs=0.05)
+    assert 0.1 < on < 0.9
+    again = score(run_of(rbm(), classifier=Fixed()), rows(gaps=True)).columns
+    assert (again["p(cat)"] == found.columns["p(cat)"]).all()
+    other = score(run_of(rbm(), classifier=Fixed()), rows(gaps=True), seed=1).columns
+    assert (other["p(cat)"] != found.columns["p(cat)"]).tolist() == [False, False, False, True]
+
+
+def test_without_a_model_of_the_data_nothing_fills_the_inputs_of_a_classifier() -> None:
+    alone = replace(run_of(DBN(None, [3], visible=SCHEMA.units()), classifier=Fixed()), pretrained=False)
+    found = score(alone, rows(gaps=True))
     assert found.columns["class"].tolist() == ["cat", None, None, None]
     assert np.isnan(found.columns["p(dog)"]).tolist() == [False, True, True, True]
     assert found.accuracy == 1.0
-    assert found.notes == ["3 rows with gaps have no class: fill them first, with memcomp-impute"]
+    assert found.notes[1] == "3 rows with gaps have no class: this run was not pretrained, so nothing fills them"
+
+
+def test_the_first_layer_of_a_stack_fills_the_inputs_of_a_classifier() -> None:
+    stack = DBN(None, [3, 2], visible=SCHEMA.units())
+    with torch.no_grad():
+        stack[0].b[0] = 4.0  # the first entry is 1
+    found = score(run_of(stack, classifier=Fixed()), rows(gaps=True)).columns
+    assert found["class"].tolist() == ["cat", "dog", "cat", "cat"]
+    assert found["p(cat)"][3] > 0.7
 
 
 def test_a_network_without_an_energy_has_classes_alone() -> None:
