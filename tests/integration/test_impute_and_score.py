@@ -144,12 +144,23 @@ def test_rows_are_scored(memcomp_score: Command, run: str) -> None:
     outcome = memcomp_score(run, "gaps.csv")
     assert outcome.status == 0, outcome.err
     found, whole = pd.read_csv("scores.csv"), ~(gappy() == "").any(axis=1)
-    names = ["row", "log_likelihood", "free_energy", "pseudo_log_likelihood", "p(cat)", "p(dog)", "class"]
+    names = [
+        "row",
+        "id",
+        "species",
+        "log_likelihood",
+        "free_energy",
+        "pseudo_log_likelihood",
+        "p(cat)",
+        "p(dog)",
+        "class",
+    ]
     assert list(found.columns) == names
     assert found["row"].tolist() == list(range(1, ROWS + 1))
+    assert read("scores.csv")[["id", "species"]].equals(people()[["id", "species"]])
     assert found[["log_likelihood", "free_energy"]].notna().all(axis=None)
     assert found["pseudo_log_likelihood"].notna().equals(whole)
-    assert found[names[4:]].notna().all(axis=None)
+    assert found[names[6:]].notna().all(axis=None)
     assert found["log_likelihood"][7] == pytest.approx(0, abs=1e-4)  # nothing of it is known
     right = found["class"] == people()["species"]
     assert f"accuracy on labelled rows: {right.mean():.4f}" in outcome.out
@@ -167,6 +178,17 @@ def test_rows_are_scored(memcomp_score: Command, run: str) -> None:
     assert memcomp_score(run, "people.csv", "output=usual_scores.csv").status == 0
     odd_scores, usual = pd.read_csv("odd_scores.csv"), pd.read_csv("usual_scores.csv").iloc[:20]
     assert odd_scores["log_likelihood"].mean() < usual["log_likelihood"].mean() - 2
+
+
+def test_a_column_with_the_name_of_a_score_is_left_out_and_that_is_said(memcomp_score: Command, run: str) -> None:
+    people().rename(columns={"species": "class", "id": "row"}).to_csv("other.csv", index=False)
+    outcome = memcomp_score(run, "other.csv")
+    assert outcome.status == 0, outcome.err
+    assert "left out of the table's columns, as what was found has this name: 'row', 'class'" in outcome.out
+    found = pd.read_csv("scores.csv")
+    assert list(found.columns)[:2] == ["row", "log_likelihood"]
+    assert found["row"][0] == 1
+    assert set(found["class"]) == {"cat", "dog"}
 
 
 def change(name: str, row: int, value: str) -> None:

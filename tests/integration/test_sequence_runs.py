@@ -50,7 +50,14 @@ def test_commands_of_the_page(memcomp_train: Train, run_command: Callable[..., O
     main = import_module("memcomp_lightning.cli.transform").main
     found = run_command("memcomp-transform", main, ("family", "whole.fasta", "output=features.csv"))
     assert found.status == 0, found.err
-    assert len(Path("features.csv").read_text().splitlines()) == 2
+    names, row = (line.split(",") for line in Path("features.csv").read_text().splitlines())
+    assert names[:2] == ["name", "h1"]
+    assert row[0] == "new"
+    scored = run_command(
+        "memcomp-score", import_module("memcomp_lightning.cli.score").main, ("potts", "whole.fasta")
+    )
+    assert scored.status == 0, scored.err
+    assert Path("scores.csv").read_text().splitlines()[1].startswith("1,new,-")
 
 
 def test_sites_are_coupled_along_the_edges_of_a_file(memcomp_train: Train, family: Path) -> None:

@@ -163,7 +163,8 @@ def test_features(folder: Path, command: Command) -> None:
     found = command("transform", "labelled", "people.csv", "output=features.csv", folder=folder)
     assert found.status == 0, found.err
     lines = (folder / "features.csv").read_text().splitlines()
-    assert lines[0] == "h1,h2,h3,h4"
+    assert lines[0] == "id,colour,species,h1,h2,h3,h4"
+    assert lines[2].startswith("1,green,dog,0.")
     assert len(lines) == 121
     again = command("transform", "labelled", "people.csv", "output=features.csv", folder=folder)
     assert again.status == 2

@@ -13,6 +13,7 @@ from memcomp_lightning.errors import UserError
 from memcomp_lightning.plotting import plot_likelihoods
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
+from memcomp_lightning.trained.beside import beside, left_out
 from memcomp_lightning.trained.partition import Annealing
 from memcomp_lightning.trained.scoring import Scores, score
 
@@ -22,7 +23,8 @@ class Settings:
     """Settings of ``memcomp-score``.
 
     Attributes:
-        output: File for the scores: .csv, .tsv, .parquet or .npz.
+        output: File for the scores: .csv, .tsv, .parquet or .npz. Names of sequences and columns that the model
+            does not have come first.
         pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
         chains: Chains of AIS, which estimates log Z where it cannot be enumerated.
         betas: Its steps at most.
@@ -67,11 +69,12 @@ def act(places: Sequence[str], settings: Settings) -> None:
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
     if settings.figures is not None and "log_likelihood" not in found.columns:
         raise UserError(f"figures={settings.figures}: this run gives no log-likelihoods to draw. Leave it out.")
-    write_columns(found.columns, output, overwrite=settings.overwrite)
+    columns, hidden = beside(run.needed_schema, table, rows, found.columns)
+    write_columns(columns, output, overwrite=settings.overwrite)
     if settings.figures is not None:
         drawn = plot_likelihoods({"rows": found.columns["log_likelihood"]})
         write_figures({"likelihoods": drawn}, Path(settings.figures), overwrite=settings.overwrite)
-    say(_summary(found, settings))
+    say("\n".join([_summary(found, settings), *left_out(hidden)]))
     say(f"written: {output}")
 
 

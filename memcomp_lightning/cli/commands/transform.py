@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out
+from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.trained import load
+from memcomp_lightning.trained.beside import beside, left_out
 from memcomp_lightning.trained.features import transform
 
 
@@ -16,7 +17,8 @@ class Settings:
     """Settings of ``memcomp-transform``.
 
     Attributes:
-        output: File for the features: .csv, .tsv, .parquet or .npz.
+        output: File for the features: .csv, .tsv, .parquet or .npz. Names of sequences and columns that the model
+            does not have come first.
         overwrite: Whether a file that is there is replaced.
         layer: Hidden layer, from 1; null is the top one.
         replica: Which of the networks of a run with data.partitions, from 0.
@@ -44,9 +46,12 @@ def act(places: Sequence[str], settings: Settings) -> None:
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite, endings=TABLES)
     run = load(places[0], replica=settings.replica, schema=settings.schema)
-    found = transform(run, run.needed_schema.read(Path(places[1]), complete=False), layer=settings.layer)
-    write_columns(found, output, overwrite=settings.overwrite)
-    say(f"{len(next(iter(found.values()))):,} rows, {len(found)} features: {output}")
+    table = existing(places[1])
+    rows = run.needed_schema.read(table, complete=False)
+    found = transform(run, rows, layer=settings.layer)
+    columns, hidden = beside(run.needed_schema, table, rows, found)
+    write_columns(columns, output, overwrite=settings.overwrite)
+    say("\n".join([f"{rows.n:,} rows, {len(found)} features: {output}", *left_out(hidden)]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,0 +1,34 @@
+"""What else a file says of its rows, beside what a model reads: names, numbers, classes."""
+
+from pathlib import Path
+
+from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.schema import Columns, Schema
+
+
+def beside(schema: Schema, path: Path, rows: Rows, found: Columns) -> tuple[Columns, list[str]]:
+    """Numbers of rows, columns of a file that the model does not have, and what was found for its rows.
+
+    Args:
+        schema: Of the run.
+        path: The file: a table; of FASTA the names are a column ``name``.
+        rows: That were read from it.
+        found: A number or word for each row.
+
+    Returns:
+        The columns, and the names of those of the file that are left out because something found has their name.
+    """
+    filled = getattr(schema, "filled", None)
+    if filled is None:  # arrays of pictures
+        return found, []
+    own = schema.decode(rows.v[:1])
+    others: Columns = {name: column for name, column in filled(path, rows.v).items() if name not in own}
+    hidden = [name for name in others if name in found]
+    first = {name: found[name] for name in ("row",) if name in found}
+    return first | {name: column for name, column in others.items() if name not in found} | found, hidden
+
+
+def left_out(hidden: list[str]) -> list[str]:
+    """A line on columns that are left out; none without any."""
+    names = ", ".join(map(repr, hidden))
+    return [f"left out of the table's columns, as what was found has this name: {names}"] if hidden else []
