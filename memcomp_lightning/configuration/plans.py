@@ -364,6 +364,17 @@ def _data(config: DictConfig, stage: str, data: "Data", units: Units) -> RowsDat
         raise UserError(f"{stage}, data: {error}") from error
 
 
+def rows_of(config: DictConfig, schema: Schema | None = None) -> RowsDataModule:
+    """The rows of a run's pretraining, read and dealt as its settings say; nothing else of the run is built.
+
+    Args:
+        config: Of the run.
+        schema: That of the run, by which a table is read; None finds it anew.
+    """
+    data = _loaded(config, schema)
+    return _data(config, "pretrain", data, shape_of(data, config).units)
+
+
 def _optimizer(config: DictConfig, stage: str, schedules: list[Schedule]) -> OptimizerFactory:
     """The optimiser's factory, tried on one parameter so that bad settings show before training."""
     factory: OptimizerFactory = instantiate(config[stage].optimizer)

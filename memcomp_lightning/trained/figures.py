@@ -1,12 +1,14 @@
 """Figures of a trained run: samples against data, and how likely both are."""
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks.against_samples import frequencies, has_categories, letters_in
-from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.shown import Shown
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import EnergyModel
@@ -14,8 +16,15 @@ from memcomp_lightning.plotting.against_data import plot_against_data
 from memcomp_lightning.plotting.likelihoods import plot_likelihoods
 from memcomp_lightning.plotting.logo import plot_logo
 from memcomp_lightning.plotting.state_frequencies import plot_state_frequencies
+from memcomp_lightning.trained.partition import LogZ
 from memcomp_lightning.trained.run import Run
+from memcomp_lightning.trained.sampling import sample
+from memcomp_lightning.trained.scoring import log_likelihoods
+from memcomp_lightning.trained.training_rows import training_rows
 from memcomp_lightning.trained.values import values, visible_of
+
+N_SAMPLES = 1000
+"""Of the model, beside scores."""
 
 _MOST_SITES = 128
 """Of sequence logos."""
@@ -59,6 +68,55 @@ def figures_of(
         weights = {name: rows.weights for name, rows in complete.items() if rows.weights is not None}
         found["free_energies"] = plot_likelihoods(minus, weights=weights, xlabel="minus free energy (nats)")
     return found
+
+
+@torch.no_grad()
+def figure_of_scores(
+    run: Run, rows: Rows, scored: NDArray[np.floating], log_z: LogZ, *, name: str = "rows", seed: int = 0
+) -> tuple[Figure, list[str]]:
+    """Log-likelihoods of scored rows, of the training and held-out data of the run, and of samples of its model.
+
+    Args:
+        run: A trained run with an energy model.
+        rows: That were scored.
+        scored: Their log-likelihoods.
+        log_z: Log Z of the model.
+        name: Of the scored rows.
+        seed: Of the samples.
+
+    Returns:
+        The figure, and what is left out or doubtful, a sentence each.
+    """
+    notes, sets = [], {name: rows}
+    try:
+        data = training_rows(run)
+    except UserError as error:
+        notes.append(f"the figure leaves out the data of the run: {error}")
+    else:
+        sets |= {"training data": data.train, "held-out data": data.heldout}
+    drawn, mixing = sample(run, N_SAMPLES, seed=seed)
+    if mixing.warning is not None:
+        notes.append(f"samples of the figure: {mixing.warning}")
+    sets["samples"] = Rows(drawn, torch.full((len(drawn),), UNLABELLED, device="cpu"))
+    # In this order they have the colours that they have in other figures.
+    names = ("training data", "samples", "held-out data", name) if len(sets) > 2 else (name, "samples")
+    shown: dict[str, NDArray[np.floating]] = {}
+    weights: dict[str, NDArray[np.floating]] = {}
+    n_gaps = 0
+    for kind in names:
+        own = sets[kind]
+        whole = torch.ones(own.n, dtype=torch.bool) if own.observed is None else own.observed.all(-1)
+        if not bool(whole.any()):
+            notes.append(f"the figure leaves out the {kind}: all of them have gaps")
+            continue
+        n_gaps += int((~whole).sum())
+        at = whole.nonzero().flatten()
+        shown[kind] = scored[at.numpy()] if kind == name else log_likelihoods(run, own.at(at), log_z, seed=seed)
+        if own.weight is not None:
+            weights[kind] = own.weight[at].double().numpy()
+    if n_gaps:
+        notes.append(f"the figure leaves out {n_gaps:,} rows with gaps, whose likelihoods are of fewer values")
+    return plot_likelihoods(shown, weights=weights), notes
 
 
 def _shown(run: Run, rows: Rows, generator: Generator) -> Shown:

@@ -30,6 +30,7 @@ class Run:
         schema: What the visible units stand for; None of a weight file without its run folder.
         pretrained: Whether ``network`` has trained weights; of a run without pretraining only the classifier has.
         settings: All settings of the run, as plain values; empty without the folder.
+        replica: Which of several networks that were trained side by side.
     """
 
     path: Path
@@ -38,6 +39,7 @@ class Run:
     schema: Schema | None = None
     settings: Mapping[str, Any] | None = None
     pretrained: bool = True
+    replica: int = 0
 
     @property
     def model(self) -> EnergyModel:
@@ -132,6 +134,8 @@ def load(
         require(replica in (None, 0), "replica", replica, "0: such a file holds one network")
         _require_no_schema(schema, "such a file has its own")
         return read(path)
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such run folder, weight file or checkpoint.")
     if network is None and schema is None and (place := _place_of(path)) is not None:
         return _of_folder(place.folder, replica, trusted, place)
     return _of_file(path, network, schema_in(Path(schema)) if isinstance(schema, str | Path) else schema, replica)
@@ -185,7 +189,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     for part in ("units", "model", "finetune"):
         # Resolved, and for good: what an interpolation stands for is checked, too.
         config[part] = OmegaConf.to_container(config[part], resolve=True)
-        _check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
+        check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
     n_replicas = _n_replicas(config)
     if n_replicas is None:
         require(replica in (None, 0), "replica", replica, "0: this run has one network")
@@ -216,13 +220,13 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
         classifier = classifier_of(config, _network(config, schema), schema.n_classes).network.eval()
         _take(classifier, states["finetune"], files["finetune"], replica)
     settings = cast(dict[str, Any], OmegaConf.to_container(config))
-    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states)
+    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states, replica or 0)
 
 
 _OWN = ("memcomp_lightning.", "torch.optim.")
 
 
-def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -> None:
+def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = ()) -> None:
     """Refuse settings that name code of other packages: a folder may come from a stranger."""
     if isinstance(node, dict):
         target = node.get("_target_")
@@ -236,7 +240,7 @@ def _check_targets(node: Any, name: str, path: Path, trusted: Collection[str]) -
     for key, value in (
         node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
     ):
-        _check_targets(value, f"{name}.{key}", path, trusted)
+        check_targets(value, f"{name}.{key}", path, trusted)
 
 
 def _is_of(target: str, packages: tuple[str, ...]) -> bool:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from memcomp_lightning import rng
@@ -102,6 +103,18 @@ def score(
         of_classes, accuracy = _classes(run, _Given(rows, v, observed, whole), notes, seed)
         columns |= of_classes
     return Scores(columns, log_z, seconds, accuracy, notes)
+
+
+@torch.no_grad()
+def log_likelihoods(run: Run, rows: Rows, log_z: LogZ, *, seed: int = 0) -> NDArray[np.float64]:
+    """The column ``log_likelihood`` of :func:`score`, where log Z is known."""
+    v, observed = values(run, rows)
+    whole = torch.ones(len(v), dtype=torch.bool) if rows.observed is None else rows.observed.all(-1)
+    run.model.visible.check(v, observed, pure=True)
+    found: NDArray[np.float64] = _likelihoods(run, run.model, _Given(rows, v, observed, whole), log_z, [], seed)[
+        "log_likelihood"
+    ]
+    return found
 
 
 class _Given(NamedTuple):

@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from running import QUIET, Outcome, launch
 
 from memcomp_lightning import rng
 from memcomp_lightning.cli import impute, score
+from memcomp_lightning.cli.commands import score as score_command
+from memcomp_lightning.errors import UserError
+from memcomp_lightning.trained import load
+from memcomp_lightning.trained.training_rows import training_rows
 
 Command = Callable[..., Outcome]
 
@@ -178,6 +183,50 @@ def test_rows_are_scored(memcomp_score: Command, run: str) -> None:
     assert memcomp_score(run, "people.csv", "output=usual_scores.csv").status == 0
     odd_scores, usual = pd.read_csv("odd_scores.csv"), pd.read_csv("usual_scores.csv").iloc[:20]
     assert odd_scores["log_likelihood"].mean() < usual["log_likelihood"].mean() - 2
+
+
+def test_the_figure_shows_rows_data_and_samples(
+    memcomp_score: Command, run: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[list[str]] = []
+
+    def write(figures: Any, output: Path, *, overwrite: bool) -> None:
+        (axes,) = figures["likelihoods"].axes
+        drawn.append([text.get_text() for text in axes.get_legend().get_texts()])
+
+    monkeypatch.setattr(score_command, "write_figures", write)
+    outcome = memcomp_score(run, "gaps.csv", "figures=looks.png")
+    assert outcome.status == 0, outcome.err
+    n_gaps = int((gappy() == "").any(axis=1).sum())
+    assert f"the figure leaves out {n_gaps} rows with gaps, whose likelihoods are of fewer values" in outcome.out
+    assert [text.partition(", mean ")[0] for text in drawn[0]] == [
+        *("training data", "samples", "held-out data", "rows of gaps.csv")
+    ]
+    whole = ~(gappy() == "").any(axis=1)
+    mean = pd.read_csv("scores.csv")["log_likelihood"][whole].mean()
+    assert drawn[0][3].endswith(f"mean {mean:.4g}")
+    # A run that was moved, whose data are gone.
+    settings = json.loads(Path("run/overrides.json").read_text())
+    Path("run/overrides.json").write_text(json.dumps({**settings, "folder": "/nowhere"}))
+    outcome = memcomp_score(run, "people.csv", "figures=looks.png", "overwrite=true")
+    assert outcome.status == 0, outcome.err
+    assert "the figure leaves out the data of the run: /nowhere/people.csv: there is no such file\n" in outcome.out
+    assert [text.partition(", mean ")[0] for text in drawn[1]] == ["rows of people.csv", "samples"]
+
+
+def test_the_data_of_a_run_are_read_again(run: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    loaded = load(run)
+    found = training_rows(loaded)
+    assert (found.train.n, found.heldout.n) == (270, 30)
+    both = torch.cat((found.train.v, found.heldout.v))
+    everybody = loaded.needed_schema.read(Path("people.csv")).v
+    assert sorted(both.tolist()) == sorted(everybody.tolist())
+    assert training_rows(loaded, most=100).train.n == 90
+    path = Path("run/settings.yaml")
+    path.write_text(path.read_text().replace("memcomp_lightning.data.Table", "os.system"))
+    with pytest.raises(UserError, match=r"data\.source is os\.system, which is code of another package"):
+        training_rows(loaded)
 
 
 def test_a_column_with_the_name_of_a_score_is_left_out_and_that_is_said(memcomp_score: Command, run: str) -> None:

@@ -18,6 +18,7 @@ from memcomp_lightning.models.units import Spin
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.trained import LoadWarning
+from memcomp_lightning.trained.training_rows import training_rows
 
 pytest.importorskip("pyarrow")
 
@@ -158,3 +159,6 @@ def test_which_of_the_networks_of_a_run_is_taken_is_said(run_command: Command) -
     second = run_command("memcomp-score", score.main, ("run", "people.csv", "replica=1", "output=second.csv"))
     assert (second.status, second.err) == (0, "")
     assert Path("second.csv").read_text() != Path("scores.csv").read_text()
+    of_both = [training_rows(load("run", replica=k)).train for k in (0, 1)]
+    assert [rows.n for rows in of_both] == [27, 27]
+    assert not torch.equal(of_both[0].v, of_both[1].v)

@@ -10,10 +10,10 @@ from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.plotting import plot_likelihoods
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import beside, left_out
+from memcomp_lightning.trained.figures import figure_of_scores
 from memcomp_lightning.trained.partition import Annealing
 from memcomp_lightning.trained.scoring import Scores, score
 
@@ -28,7 +28,8 @@ class Settings:
         pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
         chains: Chains of AIS, which estimates log Z where it cannot be enumerated.
         betas: Its steps at most.
-        figures: Folder, .png or .pdf for a histogram of the log-likelihoods.
+        figures: Folder, .png or .pdf for histograms of the log-likelihoods: those of the rows, of the data of the
+            run, where they can still be read, and of samples of the model.
         seed: Of what is drawn.
         overwrite: Whether a file that is there is replaced.
         replica: Which of the networks of a run with data.partitions, from 0.
@@ -69,12 +70,18 @@ def act(places: Sequence[str], settings: Settings) -> None:
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
     if settings.figures is not None and "log_likelihood" not in found.columns:
         raise UserError(f"figures={settings.figures}: this run gives no log-likelihoods to draw. Leave it out.")
+    figures, doubts = {}, list[str]()
+    if settings.figures is not None and found.log_z is not None:
+        likelihoods = found.columns["log_likelihood"]
+        drawn, doubts = figure_of_scores(
+            run, rows, likelihoods, found.log_z, name=f"rows of {table.name}", seed=settings.seed
+        )
+        figures["likelihoods"] = drawn
     columns, hidden = beside(run.needed_schema, table, rows, found.columns)
     write_columns(columns, output, overwrite=settings.overwrite)
     if settings.figures is not None:
-        drawn = plot_likelihoods({"rows": found.columns["log_likelihood"]})
-        write_figures({"likelihoods": drawn}, Path(settings.figures), overwrite=settings.overwrite)
-    say("\n".join([_summary(found, settings), *left_out(hidden)]))
+        write_figures(figures, Path(settings.figures), overwrite=settings.overwrite)
+    say("\n".join([_summary(found, settings), *doubts, *left_out(hidden)]))
     say(f"written: {output}")
 
 
