@@ -10,7 +10,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.against_samples import frequencies, has_categories, letters_in
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.shown import Shown
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.plotting.against_data import plot_against_data
 from memcomp_lightning.plotting.likelihoods import plot_likelihoods
@@ -111,7 +111,11 @@ def figure_of_scores(
             continue
         n_gaps += int((~whole).sum())
         at = whole.nonzero().flatten()
-        shown[kind] = scored[at.numpy()] if kind == name else log_likelihoods(run, own.at(at), log_z, seed=seed)
+        try:
+            shown[kind] = scored[at.numpy()] if kind == name else log_likelihoods(run, own.at(at), log_z, seed=seed)
+        except SettingError as error:  # grey values in between
+            notes.append(f"the figure leaves out the {kind}: {error}")
+            continue
         if own.weight is not None:
             weights[kind] = own.weight[at].double().numpy()
     if n_gaps:
