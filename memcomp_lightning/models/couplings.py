@@ -12,11 +12,9 @@ from torch import Tensor
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.gauge import zero_sum
+from memcomp_lightning.models.pair_series import N_NODES, couplings_by_series
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Units
-
-N_NODES = 8
-"""Nodes of the Gauss-Hermite rule for the fields of the other sites."""
 
 NUMBERS = 2**22
 """Numbers of a table that are held at once."""
@@ -178,33 +176,44 @@ def _effective(model: RBM, weight: Tensor, c: Tensor, b: Tensor) -> Couplings:
     of_pairs = weight.new_zeros(*model.replicas, *table, *table)
     of_sites = weight.new_zeros(*model.replicas, *table)
     nodes, rule = _rule(weight)
-    rows = max(1, NUMBERS // (c.numel() * n_states**2))
+    # Of two values everywhere, a series gives what most hidden units contribute; pair by pair is for the others.
+    in_spins = model.replicas == () and n_states == 2 and not bool(is_state.any())
+    of_spins, slow = couplings_by_series(model.hidden, weight, c) if in_spins else (None, None)
+    hidden = model.hidden if slow is None or not len(slow) else model.hidden.select(slow)
+    part = slice(None) if slow is None else slow
+    own_c, own_added, own_spread = c[..., part], added[..., part, :, :], spread[..., part, :]
+    rows = max(1, NUMBERS // (max(1, own_c.numel()) * n_states**2))
     for site in range(n_sites):
         rest = (spread.sum(-1) - spread[..., site])[..., None, None].clamp_min(0.0)
         field = c[..., None, None] + added[..., site, None, :]
-        of_sites[..., site : site + 1, :] = _expected(model, field, rest, nodes, rule)
+        of_sites[..., site : site + 1, :] = _expected(model.hidden, c.ndim - 1, field, rest, nodes, rule)
+        if not own_c.numel():
+            continue
+        rest = (own_spread.sum(-1) - own_spread[..., site])[..., None, None].clamp_min(0.0)
+        field = own_c[..., None, None] + own_added[..., site, None, :]
         # Pairs with the sites before are known: they are the same the other way round.
         for some in torch.arange(site + 1, n_sites, device=weight.device).split(rows):
-            left = (rest - spread[..., None, some]).clamp_min(0.0)
-            both = field.mT.unsqueeze(-1) + added[..., None, some, :]
-            found = _expected(model, both, left.unsqueeze(-1), nodes, rule)
+            left = (rest - own_spread[..., None, some]).clamp_min(0.0)
+            both = field.mT.unsqueeze(-1) + own_added[..., None, some, :]
+            found = _expected(hidden, c.ndim - 1, both, left.unsqueeze(-1), nodes, rule)
             of_pairs[..., site, :, some, :] = found
             of_pairs[..., some, :, site, :] = found.movedim(-3, -1)
     of_pairs = of_pairs - (of_pairs * share).sum(-1, keepdim=True)
     of_pairs = of_pairs - (of_pairs * share[..., None, None]).sum(-3, keepdim=True)
     of_sites = of_sites - (of_sites * share).sum(-1, keepdim=True)
     coupling = of_pairs.flatten(-4, -3).flatten(-2, -1)[..., slot.unsqueeze(-1), slot]
+    coupling = coupling if of_spins is None else coupling + of_spins
     coupling = ((coupling + coupling.mT) / 2).masked_fill(site_of.unsqueeze(-1) == site_of, 0.0)
     return Couplings(coupling, b + of_sites.flatten(-2)[..., slot], units)
 
 
-def _expected(model: RBM, field: Tensor, variance: Tensor, nodes: Tensor, rule: Tensor) -> Tensor:
+def _expected(hidden: Units, n_axes: int, field: Tensor, variance: Tensor, nodes: Tensor, rule: Tensor) -> Tensor:
     """Sum over the hidden units of the mean cumulant of normal fields; the hidden axis goes away."""
-    n_axes, deviation = len(model.replicas), variance.sqrt()
+    deviation = variance.sqrt()
     total = field.new_zeros(())
     for node, share in zip(nodes, rule, strict=True):
         moved = (field + deviation * node).flatten(n_axes + 1).mT
-        cumulant = model.hidden.cumulant(moved).sum(-1).unflatten(-1, field.shape[n_axes + 1 :])
+        cumulant = hidden.cumulant(moved).sum(-1).unflatten(-1, field.shape[n_axes + 1 :])
         total = total + share * cumulant
     return total
 

@@ -112,7 +112,9 @@ def figure_of_scores(
         n_gaps += int((~whole).sum())
         at = whole.nonzero().flatten()
         try:
-            shown[kind] = scored[at.numpy()] if kind == name else log_likelihoods(run, own.at(at), log_z, seed=seed)
+            shown[kind] = (
+                scored[at.numpy()] if kind == name else log_likelihoods(run, own.at(at), log_z, seed=seed)
+            )
         except SettingError as error:  # grey values in between
             notes.append(f"the figure leaves out the {kind}: {error}")
             continue
