@@ -13,7 +13,7 @@ from memcomp_lightning import load, rng
 from memcomp_lightning.cli import score, train
 from memcomp_lightning.data.sequences import SequenceSchema
 from memcomp_lightning.errors import SettingError, UserError
-from memcomp_lightning.models import DBN, RBM, Gaussian
+from memcomp_lightning.models import DBN, RBM, Normal
 from memcomp_lightning.models.units import Spin
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
@@ -134,7 +134,7 @@ def test_no_code_in_a_checkpoint_runs(tmp_path: Path) -> None:
 
 
 def test_which_of_several_networks_is_taken_is_said(tmp_path: Path) -> None:
-    drawn = RBM(5, 3, replicas=(2,), weight_init=Gaussian(std=1.0), generator=rng.stream(0, "weights"))
+    drawn = RBM(5, 3, replicas=(2,), weight_init=Normal(std=1.0), generator=rng.stream(0, "weights"))
     path = tmp_path / "several.pt"
     torch.save(drawn.state_dict(), path)
     spins = RBM(visible=Spin(5), n_hidden=3)
