@@ -7,7 +7,7 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.models import RBM, couplings
-from memcomp_lightning.models import Gaussian as Weights
+from memcomp_lightning.models import Normal as Weights
 from memcomp_lightning.models.pair_series import couplings_by_series
 from memcomp_lightning.models.units import Bernoulli, Gaussian, Mixed, ReLU, Spin
 
