@@ -1,9 +1,11 @@
 """What the units of a trained model stand for: kept with it, so that what comes out is in the user's own terms."""
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -114,16 +116,12 @@ class ImageSchema:
 
     def read(self, path: Path, *, complete: bool = True) -> Rows:
         """Grey values of an array of rows or of pictures, ``.npy`` or ``.npz``; NaN is missing."""
-        try:
-            found = np.load(path, allow_pickle=False)
-            array = (
-                found if isinstance(found, np.ndarray) else found["x" if "x" in found.files else found.files[0]]
-            )
-        except (OSError, ValueError, EOFError, IndexError) as error:
-            raise UserError(f"{path} cannot be read as an array of pictures: {error}") from error
+        array = _array(path)
         array = array.reshape(len(array), -1) if array.ndim > 1 else array
         if array.ndim != 2 or array.shape[1] != self.n_sites or not len(array):
             raise UserError(f"{path} has the shape {array.shape}: expected rows of {self.n_sites} pixels.")
+        if array.dtype.kind not in "biuf":
+            raise UserError(f"{path} has values of the kind {array.dtype}: expected numbers in [0, 1].")
         v = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
         outside = ~(((v >= 0) & (v <= 1)) | v.isnan())
         if bool(outside.any()):
@@ -148,6 +146,23 @@ class ImageSchema:
         """The schema that was written."""
         pixels = None if content["pixels"] is None else tuple(content["pixels"])
         return cls(PixelLayout(content["height"], content["width"], pixels), content["n_classes"])
+
+
+def _array(path: Path) -> NDArray[Any]:
+    """The array of a file ``.npy`` or ``.npz``: the only one, or ``x``."""
+    try:
+        with path.open("rb") as file:
+            found = np.load(file, allow_pickle=False)
+            if isinstance(found, np.ndarray):
+                return found
+            names = found.files
+            if len(names) == 1 or "x" in names:
+                array: NDArray[Any] = found["x" if "x" in names else names[0]]
+                return array
+    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+        reason = "it is no .npy or .npz of numbers" if "pickle" in str(error) else error
+        raise UserError(f"{path} cannot be read as an array of pictures: {reason}") from error
+    raise UserError(f"{path} holds the arrays {', '.join(names) or 'none'}: call the one of the pictures x.")
 
 
 def schema_of(content: Mapping[str, Any]) -> Schema:

@@ -222,7 +222,7 @@ def _kind(summary: Summary, file: str) -> str:
         row, cell = summary.odd
         raise UserError(
             f"{file}, column {summary.name!r}, row {row}: {cell!r} is no number, as {summary.n_numbers} other "
-            f"cells are. Correct it, leave it empty, or take all for words: {_typed(summary.name, 'category')}"
+            f"cells are. Correct it, leave it empty, or take all for words. {_typed(summary.name, 'category')}"
         )
     few = summary.distinct is not None
     if summary.odd is not None or (few and len(summary.words) == 2):
@@ -269,7 +269,8 @@ def _of_all(summaries: Sequence[Summary], file: str) -> Summary:
     """One summary of all columns of an array."""
     whole = Summary("all columns")
     for summary in summaries:
-        whole.odd = whole.odd or summary.odd
+        if whole.odd is None and summary.odd is not None:
+            whole.odd, whole.name = summary.odd, summary.name  # which an error names
         if whole.distinct is not None:
             joined = whole.distinct | summary.distinct if summary.distinct is not None else None
             whole.distinct = None if joined is None or len(joined) > _KEPT else joined

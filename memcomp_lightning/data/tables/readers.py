@@ -3,10 +3,14 @@
 import csv
 import gzip
 import io
+import re
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
@@ -68,6 +72,8 @@ def opened(path: Path, *, key: str | None = None) -> Opened:
 def of_frame(frame: Any) -> Opened:
     """A DataFrame of pandas, or a table of Arrow."""
     try:
+        if not isinstance(frame, pa.Table):
+            _no_name_twice([str(name) for name in frame.columns])
         table = frame if isinstance(frame, pa.Table) else pa.Table.from_pandas(frame, preserve_index=False)
     except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
         reason = " ".join(str(part) for part in error.args)
@@ -75,20 +81,27 @@ def of_frame(frame: Any) -> Opened:
             f"a column mixes kinds of values: {reason}. Make them all texts or all numbers."
         ) from error
     table = table.rename_columns([str(name) for name in table.column_names])
+    _no_name_twice(table.column_names)
     return Opened(iter(table.to_batches(max_chunksize=ROWS)), True)
 
 
-def of_array(array: Any) -> Opened:
-    """A matrix of NumPy, SciPy or torch."""
+def of_array(array: Any, where: str = "") -> Opened:
+    """A matrix of NumPy, SciPy, torch or h5py; ``where`` it is begins errors."""
     if hasattr(array, "detach"):
         array = array.detach().cpu().numpy()
-    if not hasattr(array, "tocsr"):
+    if not hasattr(array, "dtype"):
         array = np.asarray(array)
-    if array.ndim > 2:
-        array = array.reshape(len(array), -1)
-    if array.ndim != 2:
-        raise UserError(f"an array of shape {array.shape}: expected rows and columns.")
+    if len(array.shape) < 2:
+        raise UserError(f"{where}an array of shape {array.shape}: expected rows and columns.")
+    if array.dtype.kind in "cV":
+        raise UserError(f"{where}an array of {array.dtype}: expected numbers, truth values or texts.")
     return Opened(_rows_of(array), False)
+
+
+def _no_name_twice(names: list[str], where: str = "") -> None:
+    if len(set(names)) < len(names):
+        twice = min(name for name in names if names.count(name) > 1)
+        raise UserError(f"{where}two columns have the name {twice!r}: give each a name of its own.")
 
 
 def _checked(found: Opened, path: Path) -> Opened:
@@ -105,11 +118,17 @@ def _checked(found: Opened, path: Path) -> Opened:
 def _damage(path: Path) -> Iterator[None]:
     try:
         yield
-    except (pa.ArrowException, OSError, EOFError, ValueError, KeyError) as error:
+    except (pa.ArrowException, OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error) as error:
         if isinstance(error, UserError):
             raise
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UserError(f"{path} is damaged, or ends in the middle: {reason}") from error
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    if "pickle" in reason or "Python objects" in reason:
+        reason = "it is no array of numbers or texts"
+    return UserError(f"{path} is damaged, or ends in the middle: {reason}")
 
 
 def _texts(path: Path) -> Opened:
@@ -125,9 +144,7 @@ def _texts(path: Path) -> Opened:
     headed = not all(_is_number(name) or name in EMPTY for name in names)
     if not headed:
         names = [str(k) for k in range(len(names))]
-    twice = {name for name in names if names.count(name) > 1} if len(set(names)) < len(names) else set()
-    if twice:
-        raise UserError(f"{path} has two columns of the name {min(twice)!r}: give each a name of its own.")
+    _no_name_twice(names, f"{path}: ")
     texts = pa.string()
     settings: dict[str, Any] = {
         "read_options": reader.ReadOptions(column_names=names, skip_rows=int(headed), use_threads=False),
@@ -143,9 +160,19 @@ def _texts(path: Path) -> Opened:
         except pa.ArrowInvalid as error:
             if "Empty CSV" in str(error) or "no data" in str(error).lower():
                 return
+            if ragged := _RAGGED.search(str(error)):
+                row, expected, got = map(int, ragged.groups())
+                raise UserError(
+                    f"{path}, row {row - headed}: expected {expected} cells, found {got}. The file ends in the "
+                    "middle, or a cell with a delimiter in it is not in quotes."
+                ) from error
             raise
 
     return Opened(batches(), headed)
+
+
+_RAGGED = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
+"""What Arrow says of a line with too few or too many cells, which it counts from 1."""
 
 
 def _first_line(path: Path) -> str:
@@ -168,6 +195,7 @@ def _parquet(path: Path) -> Opened:
 
     with _damage(path):
         file = parquet.ParquetFile(path)
+        _no_name_twice(file.schema_arrow.names, f"{path}: ")
     return Opened(file.iter_batches(batch_size=ROWS), True)
 
 
@@ -178,41 +206,71 @@ def _excel(path: Path) -> Opened:
         frame = pd.read_excel(path, dtype=str, keep_default_na=False)
     except ImportError as error:
         raise UserError(f"{path}: to read Excel files, {error.msg}: pip install pandas openpyxl.") from error
+    except Exception as error:  # as many kinds as there are formats and parts of them
+        raise _damaged(path, error) from error
     return of_frame(frame)
 
 
 def _array(path: Path, ending: str, key: str | None) -> Opened:
     with _damage(path):
         if ending == ".npy":
-            return of_array(np.load(path, mmap_mode="r", allow_pickle=False))
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+            if not isinstance(array, np.ndarray):
+                array.close()
+                raise UserError(f"{path} holds several arrays: let its name end in .npz.")
+            return of_array(array, f"{path}: ")
         if ending == ".npz":
             return _npz(path, key)
         try:
             import h5py
         except ImportError as error:
             raise UserError(f"{path}: HDF5 needs h5py, which is not installed: pip install h5py.") from error
-        file = h5py.File(path, "r")
-        name = _chosen(list(file.keys()), key, path)
-        return Opened(_rows_of(file[name]), False)
+        names: list[str] = []
+        with h5py.File(path, "r") as file:
+            file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+            name = _chosen(names, key, path)
+            array = _Dataset(path, name, file[name].shape, file[name].dtype)
+        return of_array(array, f"{path}: ")
+
+
+@dataclass(frozen=True)
+class _Dataset:
+    """An array of an HDF5 file, which is open only while rows are read."""
+
+    path: Path
+    name: str
+    shape: tuple[int, ...]
+    dtype: Any
+
+    def __getitem__(self, rows: slice) -> Any:
+        import h5py
+
+        with h5py.File(self.path, "r") as file:
+            return file[self.name][rows]
 
 
 def _npz(path: Path, key: str | None) -> Opened:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as opened_file:
+        file = np.load(opened_file, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            return of_array(file, f"{path}: ")
         names = list(file.files)
-        if {"indices", "indptr", "format", "shape"} <= set(names):
+        if {"format", "shape", "data"} <= set(names):
             from scipy.sparse import load_npz
 
-            return of_array(load_npz(path).tocsr())
+            return of_array(load_npz(path).tocsr(), f"{path}: ")
         if key is None and len(names) > 1 and not {"x", "X"} & set(names):
             columns = {name: file[name] for name in names}
             if all(column.ndim == 1 for column in columns.values()) and len({*map(len, columns.values())}) == 1:
                 return of_frame(pa.table({name: pa.array(column) for name, column in columns.items()}))
-        return of_array(file[_chosen(names, key, path)])
+        return of_array(file[_chosen(names, key, path)], f"{path}: ")
 
 
 def _chosen(names: list[str], key: str | None, path: Path) -> str:
     if key is None:
         key = next((name for name in names if len(names) == 1 or name.lower() == "x"), None)
+    if not names:
+        raise UserError(f"{path} holds no array.")
     if key not in names:
         meant = (
             "x, or choose one in training by data=arrays data.key=NAME"
@@ -232,4 +290,8 @@ def _rows_of(array: Any) -> Iterator[Any]:
         part = array[begin : begin + rows]
         part = part.toarray() if hasattr(part, "toarray") else np.asarray(part)
         part = np.ascontiguousarray(part.reshape(len(part), -1).T)
+        if part.dtype.kind == "f":  # of other byte orders and lengths, too
+            part = part.astype(np.float32 if part.dtype.itemsize < 8 else np.float64, copy=False)
+        elif part.dtype.kind in "iu":
+            part = part.astype(part.dtype.newbyteorder("="), copy=False)
         yield pa.record_batch([pa.array(column) for column in part], names=names)

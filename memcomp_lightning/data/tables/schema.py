@@ -46,6 +46,7 @@ class TableSchema:
         weight: Name of the column of weights, None without.
         named: Whether the columns have names of their own; those of arrays are numbered.
         key: Which array of a file of several is read; None is the only one, or ``x``.
+        width: Columns that the array had, with those that are left out; None where they have names.
     """
 
     columns: tuple[Column, ...]
@@ -53,6 +54,7 @@ class TableSchema:
     weight: str | None = None
     named: bool = True
     key: str | None = None
+    width: int | None = None
 
     @cached_property
     def of_sites(self) -> tuple[Column, ...]:
@@ -163,7 +165,8 @@ class TableSchema:
         label = None if self.label is None else self.label.as_json()
         columns = [column.as_json() for column in self.columns]
         own = {"data": "table", "named": self.named, "label": label, "weight": self.weight, "columns": columns}
-        return own if self.key is None else {**own, "key": self.key}
+        kept = {name: value for name, value in (("key", self.key), ("width", self.width)) if value is not None}
+        return own | kept
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "TableSchema":
@@ -172,7 +175,8 @@ class TableSchema:
         found = None if label is None else column_of(label)
         assert found is None or isinstance(found, Category)
         columns = tuple(column_of(column) for column in content["columns"])
-        return cls(columns, found, content["weight"], content["named"], content.get("key"))
+        rest = (content.get(name) for name in ("key", "width"))
+        return cls(columns, found, content["weight"], content["named"], *rest)
 
     def _labels(self, batch: Any, names: set[str], file: str, first_row: int) -> NDArray[np.int64]:
         if self.label is None or self.label.name not in names:

@@ -198,7 +198,12 @@ def table_data(
     summaries, n, named = _summaries(begin(), name, ignore, trained)
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
-        schema, ignored = TableSchema(tuple(found.columns), found.label, found.weight, named, key), found.ignored
+        schema, ignored = (
+            TableSchema(
+                tuple(found.columns), found.label, found.weight, named, key, None if named else len(summaries)
+            ),
+            found.ignored,
+        )
     else:
         ignored = _besides(schema, [summary.name for summary in summaries])
     apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
@@ -327,6 +332,8 @@ def _whole(found: Opened, file: str, schema: TableSchema, *, complete: bool = Tr
     """All rows of a file that is small enough to be joined."""
     parts, first = [], 0
     for batch in found.batches:
+        if not found.named:
+            _check_width(batch.schema.names, schema, file)
         parts.append(schema.encode(batch, file, first, complete=complete))
         _check_rows(parts[-1].v, file, first, required=complete)
         first += batch.num_rows
@@ -336,6 +343,12 @@ def _whole(found: Opened, file: str, schema: TableSchema, *, complete: bool = Tr
     label = torch.from_numpy(np.concatenate([part.label for part in parts]))
     weights = [part.weight for part in parts if part.weight is not None]
     return _rows(v, label, torch.from_numpy(np.concatenate(weights)) if weights else None)
+
+
+def _check_width(names: list[str], schema: TableSchema, file: str) -> None:
+    """Refuse an array of another width, whose numbered columns would be taken for those of the model."""
+    if schema.width is not None and not (set(schema.site_names) <= set(names) and len(names) <= schema.width):
+        raise UserError(f"{file} has {len(names)} columns: expected {schema.width}, as the array of the training.")
 
 
 def _split(found: Opened, file: str, schema: TableSchema, sizes: list[int], order: Any) -> list[Rows]:
