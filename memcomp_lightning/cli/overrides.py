@@ -111,7 +111,10 @@ def check_command_line(
                 if message is None and not isinstance(error, CONFIGURATION_ERRORS):
                     raise
                 where = f" (job {' '.join(job)})" if line.multirun else ""
-                raise UserError((message or _naming_override(explain(error), job)) + where) from error
+                if message is None:
+                    own = isinstance(error, UserError)
+                    message = explain(error) if own else _naming_override(explain(error), job)
+                raise UserError(message + where) from error
     if line.shows or line.value(key) is not None or folder is None:
         return line
     path = claimed(Path(folder))

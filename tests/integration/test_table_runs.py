@@ -203,11 +203,17 @@ def test_paths_are_meant_from_where_they_were_typed(folder: Path, command: Comma
         (["data=table", "data.path=none.csv"], "none.csv: there is no such file"),
         (["data=table", "data.path=people.csv", "units=spin"], "units = "),
         (["data=table", "data.path=people.csv", "data.paht=x"], "data.path"),
+        (
+            ["data=table", "data.path=halves.csv", "data.columns={label: x}", "seed=1"],
+            "train: halves.csv, column 'x', row 1",
+        ),
         (["data=digits", "units=columns"], "units = 'columns' is not allowed"),
     ],
 )
 def test_mistakes(folder: Path, command: Command, settings: list[str], message: str) -> None:
-    found = command("train", *settings, folder=folder)
+    (folder / "halves.csv").write_text("x,y\n" + "1.5,a\n2.5,b\n" * 9)
+    found = command("train", *settings, "hydra.run.dir=none", folder=folder)
     assert found.status == 2
     assert message in found.err
     assert "Traceback" not in found.err
+    assert not (folder / "none").exists()
