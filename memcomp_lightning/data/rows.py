@@ -82,7 +82,7 @@ class Part(NamedTuple):
         return not bool((whole if self.at is None else whole[self.at]).all())
 
     def taken(self, step: int = 1) -> Rows:
-        """Every ``step``-th of them, copied."""
+        """Every ``step``-th of them; copied, unless it is all rows."""
         if self.at is None:
             return self.rows if step == 1 else Rows(*(None if x is None else x[::step] for x in self.rows))  # type: ignore[arg-type]
         return self.rows.at(self.at[..., ::step])
