@@ -28,7 +28,7 @@ from memcomp_lightning.training.schedules import LearningRateDecay
 N_ROWS, BATCH = 5_000, 200
 RATES = (0.01, 0.03, 0.1)
 PASSES = {"64 hidden spins": 300}
-"""Passes of models that need more than 20, tried on grids that are not measured; 1,000 were a little better still."""
+"""Passes of models that need more than 20, tried on grids that are not measured; 1,000 were a little better."""
 Matrix = NDArray[np.float64]
 
 
