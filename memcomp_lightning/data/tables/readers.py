@@ -28,10 +28,16 @@ class Opened(NamedTuple):
     Attributes:
         batches: Its rows, as record batches of Arrow.
         named: Whether the columns have names of their own; those of arrays are numbers.
+        n: Number of rows, where it is known before they are read.
     """
 
     batches: Iterator[Any]
     named: bool
+    n: int | None = None
+
+    def counted(self) -> int:
+        """Number of rows; where it is not known, all are read."""
+        return sum(batch.num_rows for batch in self.batches) if self.n is None else self.n
 
 
 def opened(path: Path, *, key: str | None = None) -> Opened:
@@ -82,7 +88,7 @@ def of_frame(frame: Any) -> Opened:
         ) from error
     table = table.rename_columns([str(name) for name in table.column_names])
     _no_name_twice(table.column_names)
-    return Opened(iter(table.to_batches(max_chunksize=ROWS)), True)
+    return Opened(iter(table.to_batches(max_chunksize=ROWS)), True, table.num_rows)
 
 
 def of_array(array: Any, where: str = "") -> Opened:
@@ -95,7 +101,7 @@ def of_array(array: Any, where: str = "") -> Opened:
         raise UserError(f"{where}an array of shape {array.shape}: expected rows and columns.")
     if array.dtype.kind in "cV":
         raise UserError(f"{where}an array of {array.dtype}: expected numbers, truth values or texts.")
-    return Opened(_rows_of(array), False)
+    return Opened(_rows_of(array), False, array.shape[0])
 
 
 def _no_name_twice(names: list[str], where: str = "") -> None:
@@ -111,7 +117,7 @@ def _checked(found: Opened, path: Path) -> Opened:
         with _damage(path):
             yield from found.batches
 
-    return Opened(batches(), found.named)
+    return found._replace(batches=batches())
 
 
 @contextmanager
@@ -196,7 +202,7 @@ def _parquet(path: Path) -> Opened:
     with _damage(path):
         file = parquet.ParquetFile(path)
         _no_name_twice(file.schema_arrow.names, f"{path}: ")
-    return Opened(file.iter_batches(batch_size=ROWS), True)
+    return Opened(file.iter_batches(batch_size=ROWS), True, file.metadata.num_rows)
 
 
 def _excel(path: Path) -> Opened:

@@ -192,7 +192,7 @@ def table_data(
     further, given = further or {}, _named(columns)
     order, n_test = None, 0
     if "test" not in further:
-        order, n_test = _order(sum(batch.num_rows for batch in begin().batches), name, test_fraction, split_seed)
+        order, n_test = _order(begin().counted(), name, test_fraction, split_seed)
     ignore = {column for column, kind in given.items() if kind == "ignore"}
     trained = None if order is None else order < len(order) - n_test
     summaries, n, named = _summaries(begin(), name, ignore, trained)
@@ -289,7 +289,7 @@ def _beside(begin: Open, label: Any) -> Opened:
         if first != len(label):
             raise UserError(f"{len(label)} labels for {first} rows: expected one for each row.")
 
-    return Opened(batches(), found.named)
+    return found._replace(batches=batches())
 
 
 def _layout(picture: tuple[int, int], schema: TableSchema) -> PixelLayout:
