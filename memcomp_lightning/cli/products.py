@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from memcomp_lightning.cli.output import refuse, say
@@ -52,18 +53,30 @@ class Usage(Generic[T]):
         """
         at = next((k for k, text in enumerate(arguments) if re.match(r"\w+=", text)), len(arguments))
         places, pairs = list(arguments[:at]), list(arguments[at:])
-        least = len(self.places) - self.optional
-        if not least <= len(places) <= len(self.places) or not all("=" in pair for pair in pairs):
-            odd = next((pair for pair in pairs if "=" not in pair), None)
-            said = f"{odd!r} is no setting" if odd else f"{len(places)} given before the settings"
+        if (said := self._trouble(places, pairs)) is not None:
             raise UserError(f"{said}: type {self.line}. {self.command} --help shows the settings.")
+        for pair in pairs:
+            try:
+                OmegaConf.from_dotlist([pair])
+            except (YAMLError, OmegaConfBaseException) as error:
+                name, _, value = pair.partition("=")
+                quoted = value.replace("'", "''")
+                raise UserError(
+                    f"{pair} cannot be read. A text with such signs stands in quotes, which the shell must leave: "
+                    f"\"{name}='{quoted}'\""
+                ) from error
         try:
-            settings = OmegaConf.from_dotlist(pairs)
-        except YAMLError as error:
-            raise UserError(
-                f"a value cannot be read ({' '.join(str(error).split())}): put it in quotes."
-            ) from error
-        return places, filled(self.settings, settings, self.command)
+            return places, filled(self.settings, OmegaConf.from_dotlist(pairs), self.command)
+        except SettingError as error:
+            raise SettingError(str(error).replace(f"{self.command}.", "", 1)) from error
+
+    def _trouble(self, places: Sequence[str], pairs: Sequence[str]) -> str | None:
+        """What is wrong with the number of places, or with what is no pair."""
+        missing = self.places[len(places) : len(self.places) - self.optional]
+        if missing:
+            return f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing before the settings"
+        odd = [*places[len(self.places) :], *(pair for pair in pairs if "=" not in pair)]
+        return f"{odd[0]!r} is no setting" if odd else None
 
     @property
     def line(self) -> str:

@@ -16,6 +16,9 @@ from memcomp_lightning.modules.weights import CheckpointError, check_fits, read_
 
 Tensors = dict[str, Tensor]
 
+_BEGINNINGS = (b"PK", b"\x80\x02")
+"""Of the files that torch writes, now and in the past."""
+
 
 class LoadWarning(UserWarning):
     """What somebody who loads a model should know of how its file was read."""
@@ -34,6 +37,13 @@ def tensors_of(path: Path) -> Tensors:
     Raises:
         CheckpointError: It is missing or damaged, or holds something else.
     """
+    with path.open("rb") as file:
+        begins = file.read(2)
+    if begins not in _BEGINNINGS:
+        raise CheckpointError(
+            f"{path} is no weight file and no checkpoint of memcomp-train: name a run folder, or a file of its "
+            "folders weights and checkpoints."
+        )
     content = read_checkpoint(path)
     if "state_dict" not in content:
         return content

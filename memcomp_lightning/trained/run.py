@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from memcomp_lightning import __version__
 from memcomp_lightning.configuration.plans import Shape, classifier_of, network_of, units_of_settings
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
 from memcomp_lightning.errors import UserError, require
@@ -189,6 +190,8 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     for part in ("units", "model", "finetune"):
         # Resolved, and for good: what an interpolation stands for is checked, too.
         config[part] = OmegaConf.to_container(config[part], resolve=True)
+        if part == "model":
+            _forget_lost_initialisers(config.model)
         check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
     n_replicas = _n_replicas(config)
     if n_replicas is None:
@@ -233,6 +236,11 @@ def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = (
         allowed = (*_OWN, *(f"{package}." for package in trusted))
         if target is not None and not (str(target).startswith(allowed) and _is_of(str(target), allowed)):
             package = str(target).partition(".")[0]
+            if _is_lost(str(target)):
+                raise UserError(
+                    f"{path}: {name} is {target}, which this version, {__version__}, does not have: the run is of "
+                    "another one, which can still use it."
+                )
             raise UserError(
                 f"{path}: {name} is {target}, which is code of another package. If you trust it, in Python type "
                 f"load({str(path)!r}, trusted=[{package!r}])."
@@ -241,6 +249,22 @@ def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = (
         node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
     ):
         check_targets(value, f"{name}.{key}", path, trusted)
+
+
+def _forget_lost_initialisers(model: DictConfig) -> None:
+    """Leave out how weights began where this version has no such initialiser: they are those of the file."""
+    for name in ("weight_init", "output_init"):
+        settings = model.get(name)
+        if isinstance(settings, DictConfig) and _is_lost(str(settings.get("_target_"))):
+            model[name] = None
+
+
+def _is_lost(target: str) -> bool:
+    """Whether a name of this package is that of nothing in this version."""
+    try:
+        return target.startswith(_OWN[0]) and resolve_name(target) is None
+    except (ImportError, AttributeError, ValueError):
+        return True
 
 
 def _is_of(target: str, packages: tuple[str, ...]) -> bool:

@@ -259,7 +259,7 @@ WRONG: dict[str, tuple[list[str], Callable[[], object] | None, str]] = {
     "no run": (["runs", "gaps.csv"], None, "runs"),
     "unfinished": (["run", "gaps.csv"], unfinished, "run has no trained weights yet: go on with memcomp-train"),
     "without a schema": (["run", "gaps.csv"], older, "run has no schema.json"),
-    "one place": (["run"], None, "1 given before the settings: type memcomp-"),
+    "one place": (["run"], None, "TABLE is missing before the settings: type memcomp-"),
     "an unknown word": (
         ["run", "gaps.csv"],
         lambda: change("colour", 4, "mauve"),

@@ -116,7 +116,7 @@ def test_code_of_others_does_not_run(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "target", ["memcomp_lightning.runs.folder.os.getcwd", "memcomp_lightning.nothing", "torch.optim.sys.exit"]
+    "target", ["memcomp_lightning.runs.folder.os.getcwd", "nothing.at.all", "torch.optim.sys.exit"]
 )
 def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target: str) -> None:
     copy = tmp_path / "copy"
@@ -124,6 +124,20 @@ def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target
     settings = copy / "settings.yaml"
     settings.write_text(settings.read_text().replace("memcomp_lightning.models.Normal", target))
     with pytest.raises(UserError, match="which is code of another package"):
+        memcomp_lightning.load(copy)
+
+
+def test_runs_of_earlier_versions(folder: Path, tmp_path: Path) -> None:
+    """How weights began is not needed any more; that a part is lost is said."""
+    copy = tmp_path / "copy"
+    shutil.copytree(folder / "labelled", copy)
+    settings = copy / "settings.yaml"
+    text = settings.read_text()
+    settings.write_text(text.replace("memcomp_lightning.models.Normal", "memcomp_lightning.models.Gaussian"))
+    then, now = memcomp_lightning.load(copy), memcomp_lightning.load(folder / "labelled")
+    assert torch.equal(then.model.b, now.model.b)
+    settings.write_text(text.replace("memcomp_lightning.models.DBN", "memcomp_lightning.models.Stack"))
+    with pytest.raises(UserError, match=r"Stack, which this version, .*, does not have"):
         memcomp_lightning.load(copy)
 
 
