@@ -25,6 +25,7 @@ from memcomp_lightning.callbacks.schedules import Schedules
 from memcomp_lightning.callbacks.stage_times import StageTimes
 from memcomp_lightning.callbacks.state_frequencies import StateFrequencies
 from memcomp_lightning.callbacks.state_weights import StateWeights
+from memcomp_lightning.callbacks.still_falling import StillFalling
 from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
 __all__ = [
@@ -53,5 +54,6 @@ __all__ = [
     "StageTimes",
     "StateFrequencies",
     "StateWeights",
+    "StillFalling",
     "TrajectoryFigure",
 ]

@@ -19,7 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar
+from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar, StillFalling
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
@@ -129,6 +129,8 @@ def build(config: DictConfig) -> Plan:
         draws = pretraining is not None and isinstance(network, DBN)
         require(draws or not rows.has_gaps, "missing values", "in the data of a classifier", NO_GAPS, FILL_IN)
         callbacks = [*_callbacks(config, "finetune"), *_judges(config, rows)]
+        if labels is not None:
+            callbacks.append(StillFalling())
         classifier = classifier_of(config, network, data.n_classes, class_weights=_class_weights(config, rows))
         if earlier is not None and earlier.weights == "finetune":
             earlier.give(classifier.network)

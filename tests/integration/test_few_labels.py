@@ -10,6 +10,7 @@ import torch
 from hydra import compose
 from running import FAST, QUIET, Outcome
 
+from memcomp_lightning.callbacks import StillFalling
 from memcomp_lightning.configuration.composition import composing
 from memcomp_lightning.configuration.plans import build
 from memcomp_lightning.errors import SettingError, UserError
@@ -54,6 +55,13 @@ def test_every_method_learns_from_the_same_rows_at_the_same_seed(
     assert all(a.equal(b) for a, b in zip(first[:2], seen[0], strict=True))
     assert "finetune, 18 labels" in outcome.out
     assert found("run")["labels"] == 18
+
+
+def test_few_labels_are_watched_for_too_few_passes() -> None:
+    for settings, n in ((["finetune.labels=18"], 1), ([], 0)):
+        finetuning = plan(*settings).finetuning
+        assert finetuning is not None
+        assert sum(isinstance(callback, StillFalling) for callback in finetuning.callbacks) == n
 
 
 def test_a_table_may_lack_some_of_its_labels(memcomp_train: Run) -> None:
