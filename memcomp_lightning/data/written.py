@@ -79,7 +79,7 @@ def write_columns(columns: Columns, path: Path, *, overwrite: bool = False) -> N
 
 
 def _text(columns: Columns, delimiter: str) -> str:
-    cells = [[_cell(x) for x in column.tolist()] for column in columns.values()]
+    cells = [_cells(column) for column in columns.values()]
     if delimiter == ",":
         return as_csv([list(columns), *zip(*cells, strict=True)])
     import csv
@@ -91,9 +91,18 @@ def _text(columns: Columns, delimiter: str) -> str:
     return buffer.getvalue()
 
 
-def _cell(x: Any) -> Any:
+def _cells(column: NDArray[Any]) -> list[Any]:
+    """Cells as texts have them: numbers with all digits of their precision, empty where there are none."""
+    if column.dtype.kind in "mM":
+        return ["" if text == "NaT" else text for text in column.astype(str).tolist()]
+    digits = 7 if column.dtype.itemsize == 4 else 17
+    return [_cell(x, digits) for x in column.tolist()]
+
+
+def _cell(x: Any, digits: int) -> Any:
     if isinstance(x, float):
-        return "" if x != x else f"{x:.0f}" if x.is_integer() and abs(x) < 1e15 else f"{x:.7g}"
+        whole = x.is_integer() and abs(x) < 1e15
+        return "" if x != x else f"{x:.0f}" if whole else repr(x) if digits > 7 else f"{x:.{digits}g}"
     return "" if x is None else x
 
 

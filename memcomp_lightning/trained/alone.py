@@ -25,7 +25,7 @@ class LoadWarning(UserWarning):
 
 
 def warn(text: str) -> None:
-    """Say it once for each file."""
+    """Say it."""
     warnings.warn(text, LoadWarning, stacklevel=5)
 
 
@@ -126,6 +126,10 @@ def network_of(state: Tensors, path: Path, schema: Schema | None) -> nn.Module:
             f"{path} lies by itself: its {' and '.join(assumed)} units are taken for bits, 0 and 1. If they are "
             f"not, name its run folder; {remedy}in Python load(PATH, network=RBM(...))."
         )
+    if isinstance(made, nn.Sequential):
+        warn(f"{path} lies by itself: its outputs are taken for logits of softmax. If not, name its run.")
+    elif isinstance(made, DBN) and len(made) > 1:
+        warn(f"{path} lies by itself: its layers are taken for trained one by one. If not, name its run folder.")
     return made
 
 

@@ -4,6 +4,20 @@ from pathlib import Path
 
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.schema import Columns, Schema
+from memcomp_lightning.errors import UserError
+
+
+def others_of(schema: Schema, path: Path, n: int) -> Columns:
+    """Columns of a file of n rows that the model does not have; of FASTA the names; none of pictures.
+
+    Raises:
+        UserError: The file has changed since it was read.
+    """
+    read = getattr(schema, "others", None)
+    found: Columns = {} if read is None else read(path)
+    if any(len(column) != n for column in found.values()):
+        raise UserError(f"{path} has changed while it was worked on: it had {n} rows.")
+    return found
 
 
 def beside(schema: Schema, path: Path, rows: Rows, found: Columns) -> tuple[Columns, list[str]]:
@@ -18,11 +32,7 @@ def beside(schema: Schema, path: Path, rows: Rows, found: Columns) -> tuple[Colu
     Returns:
         The columns, and the names of those of the file that are left out because something found has their name.
     """
-    filled = getattr(schema, "filled", None)
-    if filled is None:  # arrays of pictures
-        return found, []
-    own = schema.decode(rows.v[:1])
-    others: Columns = {name: column for name, column in filled(path, rows.v).items() if name not in own}
+    others = others_of(schema, path, rows.n)
     hidden = [name for name in others if name in found]
     first = {name: found[name] for name in ("row",) if name in found}
     return first | {name: column for name, column in others.items() if name not in found} | found, hidden

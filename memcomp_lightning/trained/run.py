@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
+from types import ModuleType
 from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -106,7 +107,7 @@ def load(
 ) -> Run:
     """Read a run folder, a weight file or a checkpoint.
 
-    No data are read, and no code but this package's runs: settings that name other code are refused.
+    No data are read, and no code runs but that of models: settings that name anything else are refused.
 
     A :class:`~memcomp_lightning.trained.alone.LoadWarning` says what was assumed: which of several networks was
     taken, units that a file does not name, a run that has not finished.
@@ -226,24 +227,28 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states, replica or 0)
 
 
-_OWN = ("memcomp_lightning.", "torch.optim.")
+_PARTS = ("models", "data", "objective", "training", "samplers")
+_PACKAGES = (*(f"memcomp_lightning.{name}." for name in _PARTS), "torch.optim.")
+"""What classes of settings that are read here may be of: none of them does more than hold numbers or read data."""
+
+_FUNCTIONS = ("memcomp_lightning.interop.annealer_graph", "memcomp_lightning.models.connectivity.")
+"""Functions that list pairs of units, for a machine's connectivity."""
 
 
 def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = ()) -> None:
-    """Refuse settings that name code of other packages: a folder may come from a stranger."""
-    if isinstance(node, dict):
-        target = node.get("_target_")
-        allowed = (*_OWN, *(f"{package}." for package in trusted))
-        if target is not None and not (str(target).startswith(allowed) and _is_of(str(target), allowed)):
-            package = str(target).partition(".")[0]
+    """Refuse settings that name other code than parts of a model: a folder may come from a stranger."""
+    if isinstance(node, dict) and (target := node.get("_target_")) is not None:
+        of_theirs = tuple(f"{package}." for package in trusted)
+        if not (_is_part(str(target)) or _is_of(str(target), of_theirs)):
             if _is_lost(str(target)):
                 raise UserError(
                     f"{path}: {name} is {target}, which this version, {__version__}, does not have: the run is of "
                     "another one, which can still use it."
                 )
+            package = str(target).partition(".")[0]
             raise UserError(
-                f"{path}: {name} is {target}, which is code of another package. If you trust it, in Python type "
-                f"load({str(path)!r}, trusted=[{package!r}])."
+                f"{path}: {name} is {target}, which is no part of a model of this package. If you trust it, in "
+                f"Python type load({str(path)!r}, trusted=[{package!r}])."
             )
     for key, value in (
         node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
@@ -262,18 +267,31 @@ def _forget_lost_initialisers(model: DictConfig) -> None:
 def _is_lost(target: str) -> bool:
     """Whether a name of this package is that of nothing in this version."""
     try:
-        return target.startswith(_OWN[0]) and resolve_name(target) is None
+        return target.startswith("memcomp_lightning.") and resolve_name(target) is None
     except (ImportError, AttributeError, ValueError):
         return True
 
 
+def _is_part(target: str) -> bool:
+    """Whether a name is that of a class, or function, that a model may be made of."""
+    found = _named(target)
+    if isinstance(found, type):
+        return _is_of(target, _PACKAGES)
+    return callable(found) and target.startswith(_FUNCTIONS) and _is_of(target, ("memcomp_lightning.",))
+
+
 def _is_of(target: str, packages: tuple[str, ...]) -> bool:
-    """Whether a name is that of a class or function which one of the packages defines, not of what it imports."""
+    """Whether one of the packages defines what has this name, and does not only import it."""
+    return target.startswith(packages) and f"{getattr(_named(target), '__module__', '')}.".startswith(packages)
+
+
+def _named(target: str) -> Any:
+    """What has this name; a function rather than the module that it is named as."""
     try:
         found = resolve_name(target)
     except (ImportError, AttributeError, ValueError):
-        return False
-    return f"{getattr(found, '__module__', '')}.".startswith(packages)
+        return None
+    return getattr(found, target.rpartition(".")[2], found) if isinstance(found, ModuleType) else found
 
 
 def _network(config: DictConfig, schema: Schema) -> nn.Module:

@@ -15,14 +15,13 @@ from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.schema import Columns
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.likelihood import log_likelihood_or_bound, log_pseudo_likelihood
-from memcomp_lightning.likelihood.missing import of_observed
+from memcomp_lightning.likelihood.layers import NUMBERS
+from memcomp_lightning.likelihood.missing import MissingChains, finders, of_observed
 from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy
 from memcomp_lightning.models import DBN, EnergyModel
 from memcomp_lightning.trained.partition import Annealing, LogZ, log_z_of
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import values
-from memcomp_lightning.training.filling import Filling
-from memcomp_lightning.types import Batch
 
 CLASS_DRAWS = 100
 """Of what is missing of a row, over which its class probabilities are averaged."""
@@ -62,8 +61,8 @@ def score(
     * ``free_energy``: F, so that ``log_likelihood`` is -F - log Z, in the units of the model.
     * ``pseudo_log_likelihood``: :math:`\sum_j \log p(v_j | v_{-j})`, which needs no log Z; NaN of rows with gaps.
     * ``p(CLASS)`` and ``class`` of the fine-tuned network, if there is one. Rows with gaps have the mean over
-      :data:`CLASS_DRAWS` draws of what is missing, by the model of the data, as in training; they are empty where
-      the run has no such model.
+      :data:`CLASS_DRAWS` draws of what is missing, by the model of the data: exact ones where it is small, else of
+      chains whose agreement is measured; they are empty where the run has no such model.
 
     Args:
         run: A trained run.
@@ -180,9 +179,12 @@ def _classes(run: Run, given: _Given, notes: list[str], seed: int) -> tuple[Colu
         p[whole] = _probabilities(run, v[whole])
     n_gaps, model = int((~whole).sum()), _of_data(run)
     if n_gaps and observed is not None and model is not None:
-        p[~whole] = _mean_probabilities(run, model, v[~whole], observed[~whole], seed)
+        p[~whole], n_apart = _mean_probabilities(run, model, v[~whole], observed[~whole], seed)
         known[:] = True
-        notes.append(f"classes of {n_gaps:,} rows with gaps: means over {CLASS_DRAWS} draws of what is missing")
+        apart = f"; the chains of {n_apart:,} of them do not agree yet" if n_apart else ""
+        notes.append(
+            f"classes of {n_gaps:,} rows with gaps: means over {CLASS_DRAWS} draws of what is missing{apart}"
+        )
     elif n_gaps:
         notes.append(
             f"{n_gaps:,} rows with gaps have no class: this run was not pretrained, so nothing fills them"
@@ -215,13 +217,18 @@ def _probabilities(run: Run, v: Tensor) -> Tensor:
     return logits.sigmoid() if by_squares else torch.softmax(logits, dim=-1)
 
 
-def _mean_probabilities(run: Run, model: EnergyModel, v: Tensor, observed: Tensor, seed: int) -> Tensor:
-    """Their means over draws of what is missing."""
-    filling, generator = Filling(model), rng.stream(seed, "gaps of a classifier")
-    found = []
-    for some, known in zip(v.split(_ROWS_AT_ONCE), observed.split(_ROWS_AT_ONCE), strict=True):
-        many, masks = (part.repeat_interleave(CLASS_DRAWS, dim=0) for part in (some.to(model.b), known))
-        label = torch.full((len(many),), UNLABELLED, device="cpu")
-        drawn = filling.complete(Batch(many, label, 1.0, True, None, masks), generator).v
-        found.append(_probabilities(run, drawn).unflatten(0, (len(some), CLASS_DRAWS)).mean(1))
-    return torch.cat(found)
+def _mean_probabilities(
+    run: Run, model: EnergyModel, v: Tensor, observed: Tensor, seed: int
+) -> tuple[Tensor, int]:
+    """Their means over draws of what is missing, and the number of rows whose chains do not agree."""
+    generator, n_apart = rng.stream(seed, "gaps of a classifier"), 0
+    chains = MissingChains()
+    found = torch.empty(len(v), len(run.needed_schema.class_names))
+    for finder, rows in finders(model, observed, chains):
+        at_once = max(1, min(_ROWS_AT_ONCE, NUMBERS // finder.numbers_a_row(model, CLASS_DRAWS)))
+        for some in rows.split(at_once):
+            draws = finder.find(model, v[some], observed[some], m=CLASS_DRAWS, generator=generator)
+            n_apart += int((draws.r_hat > chains.r_hat).sum())
+            of_draws = _probabilities(run, draws.draws.flatten(0, 1)).unflatten(0, draws.draws.shape[:2])
+            found[some] = of_draws.mean(0).to(found)
+    return found, n_apart

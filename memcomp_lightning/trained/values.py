@@ -1,19 +1,31 @@
 """Rows as values of a model's visible units."""
 
+from typing import cast
+
+from omegaconf import OmegaConf
 from torch import Tensor
 
+from memcomp_lightning.configuration.plans import units_of_settings
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.models import DBN
-from memcomp_lightning.models.units import Units
+from memcomp_lightning.models import DBN, EnergyModel
+from memcomp_lightning.models.units import Bernoulli, Units
 from memcomp_lightning.trained.run import Run
 
 
 def visible_of(run: Run) -> Units:
-    """The visible units of a run."""
+    """The visible units of a run: those of its model, or what a network without one is given."""
     network = run.network
-    units: Units = network[0].visible if isinstance(network, DBN) else run.model.visible
-    return units
+    if isinstance(network, DBN):
+        return network[0].visible
+    if hasattr(network, "energy"):
+        return cast(EnergyModel, network).visible
+    schema = run.needed_schema
+    if (units := schema.units()) is not None:
+        return units
+    if not run.settings:
+        return Bernoulli(schema.n_sites)
+    return units_of_settings(OmegaConf.create(dict(run.settings)), schema.n_sites)
 
 
 def values(run: Run, rows: Rows) -> tuple[Tensor, Tensor | None]:

@@ -17,7 +17,10 @@ N_DRAWS = 10
 
 
 class Filling:
-    r"""Fills gaps by draws from p(missing | observed) of a trained model, which is copied and stays as it is.
+    r"""Fills gaps by draws of a trained model, which is copied and stays as it is.
+
+    They come after ten sweeps from a random start with the known values clamped: quick enough for each update,
+    and near to p(missing | observed) where these sweeps mix. ``memcomp-score`` takes as long as it needs.
 
     A network that is trained sees a draw of its own each time. Rows that are judged have the mean of the class
     probabilities over :data:`N_DRAWS` draws, which estimates :math:`\sum p(class | v) p(missing | observed)`.

@@ -39,7 +39,7 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
     observed = None
     if bool(v.isnan().any()):
         observed = ~v.isnan()
-        v = v.nan_to_num(nan=0.0)
+        v = torch.where(observed, v, 0.0)
     if units is not None:
         if v.shape[-1] == units.n_sites != units.n:
             v = units.encode(v)

@@ -225,7 +225,9 @@ def test_the_data_of_a_run_are_read_again(run: str, tmp_path: Path, monkeypatch:
     assert training_rows(loaded, most=100).train.n == 90
     path = Path("run/settings.yaml")
     path.write_text(path.read_text().replace("memcomp_lightning.data.Table", "os.system"))
-    with pytest.raises(UserError, match=r"data\.source is os\.system, which is code of another package"):
+    with pytest.raises(
+        UserError, match=r"data\.source is os\.system, which is no part of a model of this package"
+    ):
         training_rows(loaded)
 
 

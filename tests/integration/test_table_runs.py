@@ -109,9 +109,11 @@ def test_code_of_others_does_not_run(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "labelled", copy)
     settings = copy / "settings.yaml"
     settings.write_text(settings.read_text().replace("memcomp_lightning.models.Normal", "os.system"))
-    with pytest.raises(UserError, match=r"model\.\w+_init is os\.system, which is code of another package"):
+    with pytest.raises(
+        UserError, match=r"model\.\w+_init is os\.system, which is no part of a model of this package"
+    ):
         memcomp_lightning.load(copy)
-    with pytest.raises(UserError, match="which is code of another package"):
+    with pytest.raises(UserError, match="which is no part of a model of this package"):
         memcomp_lightning.load(copy / "weights/pretrain.pt")
 
 
@@ -123,7 +125,7 @@ def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target
     shutil.copytree(folder / "labelled", copy)
     settings = copy / "settings.yaml"
     settings.write_text(settings.read_text().replace("memcomp_lightning.models.Normal", target))
-    with pytest.raises(UserError, match="which is code of another package"):
+    with pytest.raises(UserError, match="which is no part of a model of this package"):
         memcomp_lightning.load(copy)
 
 
@@ -149,7 +151,9 @@ def test_what_an_interpolation_stands_for_is_checked(folder: Path, tmp_path: Pat
     before, _, after = text.partition("  output_init:\n")
     after = after.partition("\n  weights:")[2]
     settings.write_text(before + "  weights:" + after + "\nhidden_away:\n  _target_: os.getcwd\n")
-    with pytest.raises(UserError, match=r"model\.output_init is os\.getcwd, which is code of another package"):
+    with pytest.raises(
+        UserError, match=r"model\.output_init is os\.getcwd, which is no part of a model of this package"
+    ):
         memcomp_lightning.load(copy)
 
 

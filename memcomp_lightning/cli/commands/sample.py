@@ -5,18 +5,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
-from memcomp_lightning.data.schema import ImageSchema, Schema
+from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
 from memcomp_lightning.data.written import SEQUENCE, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.trained import load
+from memcomp_lightning.trained.beside import others_of
 from memcomp_lightning.trained.given import given_row
+from memcomp_lightning.trained.imputation import completed_columns
 from memcomp_lightning.trained.sampling import sample
 
 N_ROWS = 1000
@@ -104,7 +107,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
         seed=settings.seed,
     )
     seconds = time.perf_counter() - begin
-    columns = in_one_array(schema.decode(v), schema, output)
+    columns = in_one_array(_columns(settings, schema, given, v), schema, output)
     write_columns(columns, output, overwrite=settings.overwrite)
     if beside is not None:
         from memcomp_lightning.plotting.written import write_figures
@@ -132,6 +135,16 @@ def _given(settings: Settings, schema: Schema) -> Rows | None:
             )
         return schema.read(file, complete=False)
     return given_row(schema, settings.given)
+
+
+def _columns(settings: Settings, schema: Schema, given: Rows | None, v: Tensor) -> Columns:
+    """Rows in the user's columns; those of a file keep its other columns, each row as often as it was drawn."""
+    if given is None or not isinstance(settings.given, str):
+        return schema.decode(v)
+    if len(v) == given.n:
+        return completed_columns(schema, Path(settings.given), v)
+    others = others_of(schema, Path(settings.given), given.n)
+    return {name: np.repeat(column, len(v) // given.n) for name, column in others.items()} | schema.decode(v)
 
 
 def _beside(settings: Settings, schema: Schema) -> Rows | None:

@@ -118,9 +118,15 @@ class SequenceSchema:
         file, found = read_sequences(path), self.decode(v)
         if not file.is_table:
             return {"name": np.array(file.names, dtype=object), **found}
-        from memcomp_lightning.data.tables.filled import columns_of  # Arrow is an extra
+        from memcomp_lightning.data.tables.filled import others  # Arrow is an extra
 
-        return {**columns_of(path), **found}
+        return {**others(path, ()), **found}
+
+    def others(self, path: Path) -> dict[str, NDArray[Any]]:
+        """Names of the sequences of a file, or the other columns of their table."""
+        none = torch.zeros(0, self.n_sites)
+        own = self.decode(none)
+        return {name: column for name, column in self.filled(path, none).items() if name not in own}
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, from which :meth:`from_json` makes the schema again."""

@@ -183,10 +183,10 @@ class Real(Column):
         return ((cells.numbers() - self.mean) / self.scale).astype(np.float32)
 
     def write(self, numbers: NDArray[np.floating[Any]]) -> NDArray[Any]:
-        """In the user's units."""
+        """In the user's units, to the seven digits that single precision has."""
         found = numbers.astype(np.float64) * self.scale + self.mean
         if not self.whole:
-            return found
+            return _rounded(found)
         return found.round() if np.isnan(found).any() else found.round().astype(np.int64)
 
     @property
@@ -205,6 +205,15 @@ def column_of(content: Mapping[str, Any]) -> Column:
     kind = settings.pop("kind")
     require_choice("kind of a column", kind, tuple(KINDS))
     return KINDS[kind](**settings)
+
+
+def _rounded(x: NDArray[np.float64], digits: int = 7) -> NDArray[np.float64]:
+    """Numbers to so many significant digits, each the float that is nearest to them."""
+    size = np.floor(np.log10(np.abs(np.where(np.isfinite(x) & (x != 0), x, 1.0))))
+    places = np.clip(digits - 1 - size, -300, 22)
+    unit = 10.0 ** np.abs(places)  # exact up to 10^22: one rounding each way
+    found: NDArray[np.float64] = np.where(places >= 0, np.round(x * unit) / unit, np.round(x / unit) * unit)
+    return found
 
 
 def _within(cells: Cells, allowed: Any, words: str) -> Numbers:

@@ -1,5 +1,6 @@
 """A table as it was, with numbers of a model in its empty cells."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +51,14 @@ def filled(path: Path, schema: TableSchema, v: Tensor) -> Columns:
     return columns | {name: own[name].write(numbers[:, at[name]]) for name in own if name not in columns}
 
 
-def columns_of(path: Path) -> Columns:
-    """All columns of a file as they are."""
-    batches = list(opened(path).batches)
-    names = batches[0].schema.names
-    return {name: np.concatenate([_plain(batch.column(name)) for batch in batches]) for name in names}
+def others(path: Path, own: Collection[str], *, key: str | None = None) -> Columns:
+    """The columns of a file that are none of these, as they are; the others are let go as they are read."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    for batch in opened(path, key=key).batches:
+        for name, cells in zip(batch.schema.names, batch.columns, strict=True):
+            if name not in own:
+                parts.setdefault(name, []).append(_plain(cells))
+    return {name: np.concatenate(some) for name, some in parts.items()}
 
 
 def _plain(cells: Any) -> NDArray[Any]:

@@ -85,6 +85,8 @@ class Summary:
         self.n += len(empty)
 
     def _add_numbers(self, numbers: Any, known: Any) -> None:
+        if not len(numbers):  # a part of an Arrow table may have no rows
+            return
         if math.isnan(self._first):
             self._first = float(numbers[0]) - self.n
         in_turn = numbers == self._first + self.n + np.arange(len(numbers))

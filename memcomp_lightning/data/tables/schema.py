@@ -154,6 +154,12 @@ class TableSchema:
 
         return read_rows(path, self, complete=complete)
 
+    def others(self, path: Path) -> Columns:
+        """Columns of a file that the model does not have."""
+        from memcomp_lightning.data.tables.filled import others
+
+        return others(path, {column.name for column in self.columns}, key=self.key)
+
     def filled(self, path: Path, v: Tensor) -> Columns:
         """All columns of a file, its empty cells that the model has a number for filled with those of v."""
         from memcomp_lightning.data.tables.filled import filled

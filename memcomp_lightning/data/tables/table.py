@@ -330,19 +330,32 @@ def _summaries(
 
 def _whole(found: Opened, file: str, schema: TableSchema, *, complete: bool = True) -> Rows:
     """All rows of a file that is small enough to be joined."""
-    parts, first = [], 0
+    v, label, weight, first = list[NDArray[Any]](), list[NDArray[Any]](), list[NDArray[Any]](), 0
     for batch in found.batches:
         if not found.named:
             _check_width(batch.schema.names, schema, file)
-        parts.append(schema.encode(batch, file, first, complete=complete))
-        _check_rows(parts[-1].v, file, first, required=complete)
+        part = schema.encode(batch, file, first, complete=complete)
+        _check_rows(part.v, file, first, required=complete)
+        v.append(part.v)
+        label.append(part.label)
+        if part.weight is not None:
+            weight.append(part.weight)
         first += batch.num_rows
     if not first:
         raise UserError(f"{file} has no rows.")
-    v = torch.from_numpy(np.concatenate([part.v for part in parts]))
-    label = torch.from_numpy(np.concatenate([part.label for part in parts]))
-    weights = [part.weight for part in parts if part.weight is not None]
-    return _rows(v, label, torch.from_numpy(np.concatenate(weights)) if weights else None)
+    joined = [torch.from_numpy(_joined(parts)) for parts in (v, label, weight) if parts]
+    return _rows(joined[0], joined[1], joined[2] if len(joined) > 2 else None)
+
+
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    """Arrays one after the other; each is let go when it is copied, so that the rows are not held twice."""
+    found = np.empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype)
+    end = len(found)
+    while parts:
+        part = parts.pop()
+        found[end - len(part) : end] = part
+        end -= len(part)
+    return found
 
 
 def _check_width(names: list[str], schema: TableSchema, file: str) -> None:

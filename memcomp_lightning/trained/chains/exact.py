@@ -3,11 +3,11 @@
 import torch
 from torch import Generator, Tensor
 
-from memcomp_lightning import rng
 from memcomp_lightning.likelihood import exact_samples
-from memcomp_lightning.models import RBM, EnergyModel
+from memcomp_lightning.likelihood.missing.base import drawn
+from memcomp_lightning.models import RBM
 from memcomp_lightning.models.machine import log2_states
-from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field
+from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field, visible_units_coupled
 from memcomp_lightning.models.units import all_states
 from memcomp_lightning.trained.chains.target import Target
 
@@ -28,7 +28,7 @@ def why_exact(target: Target) -> str | None:
         n, most, what = model.n_enumerated, MOST_BITS, "of the smaller layer"
         if not isinstance(model, RBM):
             what = "outside the largest class of units"
-    elif model.hidden.real or not model.n_hidden or _visible_are_coupled(model):
+    elif model.hidden.real or not model.n_hidden or visible_units_coupled(model):
         return None
     else:
         n, most, what = log2_states(model.hidden), MOST_HIDDEN_BITS, "of the hidden layer, for each row"
@@ -46,7 +46,7 @@ def exact(target: Target, n: int, *, generator: Generator) -> Tensor:
         return exact_samples(model, n, generator=generator, max_units=MOST_BITS + 1)
     found = model.all_configurations()
     assert found.weight is not None
-    number = _numbers(found.weight.double().log(), n, generator)
+    number = drawn(found.weight.double().unsqueeze(0), n, generator=generator).squeeze(1)
     x = torch.cat((found.v, found.h), dim=-1)[number]
     largest, _, _ = model.outside_largest_class()
     x[:, largest.units] = largest.kind.sample(largest.field(x), generator=generator)
@@ -58,19 +58,8 @@ def _given(target: Target, n: int, generator: Generator) -> Tensor:
     assert v is not None
     assert observed is not None
     states = all_states(model.hidden, v)
-    number = _numbers(log_weight_of_hidden(model, v, observed, states).double(), n, generator).flatten()
-    drawn = model.visible.sample(visible_field(model, states[number]), generator=generator)
+    weight = torch.softmax(log_weight_of_hidden(model, v, observed, states).double(), dim=-1)
+    number = drawn(weight, n, generator=generator).T.flatten()
+    free = model.visible.sample(visible_field(model, states[number]), generator=generator)
     known, fixed = v.repeat_interleave(n, dim=0), observed.repeat_interleave(n, dim=0)
-    return torch.where(fixed, known, drawn)
-
-
-def _numbers(log_weight: Tensor, n: int, generator: Generator) -> Tensor:
-    """Draw n numbers of the last axis, ``(..., n)``, by inversion."""
-    below = torch.softmax(log_weight, dim=-1).cumsum(-1)
-    u = rng.uniform((*below.shape[:-1], n), generator=generator, like=below) * below[..., -1:]
-    return torch.searchsorted(below, u, right=True)
-
-
-def _visible_are_coupled(model: EnergyModel) -> bool:
-    pairs = model.quadratic_form().pairs
-    return pairs is not None and bool((pairs < model.n_visible).all(-1).any())
+    return torch.where(fixed, known, free)

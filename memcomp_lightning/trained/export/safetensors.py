@@ -40,6 +40,7 @@ def write(run: Run, path: Path, what: str) -> Written:
         "version": __version__,
         "networks": {name: described(part) for name, part in parts.items()},
         "schema": None if run.schema is None else run.schema.as_json(),
+        "pretrained": run.pretrained,
         "settings": {name: x for name, x in (run.settings or {}).items() if name in _KEPT},
     }
     with written_whole(path) as partial:
@@ -79,7 +80,8 @@ def read(path: Path) -> Run:
         content = json.loads(header)
         networks = {name: _network(name, kinds, tensors) for name, kinds in content["networks"].items()}
         schema = None if content["schema"] is None else schema_of(content["schema"])
-        return Run(path, networks["network"], networks.get("classifier"), schema, content["settings"])
+        pretrained = bool(content.get("pretrained", True))
+        return Run(path, networks["network"], networks.get("classifier"), schema, content["settings"], pretrained)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, SettingError) as error:
         raise CheckpointError(
             f"checkpoint {path} is damaged, or of a later version than {__version__}: "
