@@ -68,7 +68,8 @@ class Usage(Generic[T]):
         try:
             return places, filled(self.settings, OmegaConf.from_dotlist(pairs), self.command)
         except SettingError as error:
-            raise SettingError(str(error).replace(f"{self.command}.", "", 1)) from error
+            said = str(error).replace(f"{self.command}.", "", 1)
+            raise SettingError(said.replace("settings by name with a _target_", "'{NAME: VALUE}'")) from error
 
     def _trouble(self, places: Sequence[str], pairs: Sequence[str]) -> str | None:
         """What is wrong with the number of places, or with what is no pair."""
@@ -136,3 +137,7 @@ def carry_out(
             act(places, settings)
     except (UserError, SettingError, CheckpointError, OSError) as error:
         refuse(usage.command, UserError(in_words(error)))
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "allocate memory" not in str(error):
+            raise
+        refuse(usage.command, UserError("there is not enough memory for so many numbers: ask for fewer rows."))

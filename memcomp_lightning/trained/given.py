@@ -9,6 +9,9 @@ from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.errors import UserError
 
+FAR = 8.0
+"""Standard deviations from the mean of the training data."""
+
 _SPELT = {True: ("true", "yes", "on", "y"), False: ("false", "no", "off", "n")}
 """Words that YAML takes for truth values."""
 
@@ -24,6 +27,8 @@ def given_row(schema: Schema, given: Mapping[str, Any]) -> Rows:
         UserError: There is no such column, or it cannot have this value.
     """
     names = schema.site_names
+    if not given:
+        raise UserError(f"given = {{}} has no column: expected known values, as in {{{names[0]}: VALUE}}.")
     for name in given:
         if name not in names:
             shown = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
@@ -33,6 +38,25 @@ def given_row(schema: Schema, given: Mapping[str, Any]) -> Rows:
         return _of_table(schema, given)
     numbers = [_number(schema, name, given[name]) if name in given else float("nan") for name in names]
     return _rows(torch.tensor([numbers], dtype=torch.float32, device="cpu"))
+
+
+def unlike_training(schema: Schema, rows: Rows) -> list[str]:
+    """A sentence for each known real value that is far from all that a model has been trained on.
+
+    The model answers all the same, by what it has learned elsewhere.
+    """
+    found = []
+    for site, column in enumerate(getattr(schema, "of_sites", ())):
+        if column.kind != "real":
+            continue
+        v = rows.v[:, site] if rows.observed is None else rows.v[rows.observed[:, site], site]
+        furthest = float(v.abs().max()) if len(v) else 0.0
+        if furthest > FAR:
+            found.append(
+                f"given, column {column.name!r}: a value is {furthest:.0f} standard deviations from the "
+                f"mean of the training data, {column.mean:.4g}; the model has seen nothing like it"
+            )
+    return found
 
 
 def _of_table(schema: Any, given: Mapping[str, Any]) -> Rows:

@@ -18,7 +18,7 @@ from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import others_of
-from memcomp_lightning.trained.given import given_row
+from memcomp_lightning.trained.given import given_row, unlike_training
 from memcomp_lightning.trained.imputation import completed_columns
 from memcomp_lightning.trained.sampling import sample
 
@@ -120,6 +120,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
     say(f"{len(v):,} rows in {seconds:.1f} s: {output}")
     for line in mixing.lines():
         say(f"  {line}")
+    for text in [] if given is None else unlike_training(schema, given):
+        say(f"memcomp-sample: warning: {text}", error=True)
     if mixing.warning is not None:
         say(f"memcomp-sample: warning: {mixing.warning}", error=True)
 

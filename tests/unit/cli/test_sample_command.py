@@ -130,6 +130,25 @@ def test_what_cannot_be_done_is_said_in_a_line_and_nothing_is_written(table, cap
     assert (table / "there.csv").read_text() == "mine"
 
 
+def test_a_value_far_from_the_training_data_is_warned_of(table, capsys):
+    command.main(["run", "n=3", "given={age: 300}"])
+    assert "given, column 'age': a value is 29 standard deviations from the mean" in capsys.readouterr().err
+    command.main(["run", "n=3", "given={age: 50}", "overwrite=true"])
+    assert capsys.readouterr().err == ""
+
+
+def test_more_rows_than_memory_are_refused(table, capsys):
+    assert "not enough memory" in refused(capsys, "n=100000000000000")
+    assert not (table / "rows.csv").exists()
+
+
+def test_nothing_given_and_no_mapping(table, capsys):
+    assert "given = {} has no column" in refused(capsys, "given={}")
+    assert "given = 30 is not allowed: expected '{NAME: VALUE}', or text, or null" in refused(capsys, "given=30")
+    assert "\"output='[a'\"" in refused(capsys, "output=[a")
+    assert "'n' is no setting" in refused(capsys, "n")
+
+
 def test_chains_that_do_not_mix_are_warned_of(use, capsys):
     rbm = RBM(8, 6)
     with torch.no_grad():
