@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy
 import pytest
 import torch
+from omegaconf import OmegaConf
 from running import QUIET, Outcome
 
 import memcomp_lightning
@@ -16,6 +17,7 @@ from memcomp_lightning.configuration import plans
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import RBM
 from memcomp_lightning.trained import LoadWarning
+from memcomp_lightning.trained.run import check_targets
 
 pytest.importorskip("pyarrow")
 
@@ -129,6 +131,28 @@ def test_imports_of_ours_are_code_of_others(folder: Path, tmp_path: Path, target
         memcomp_lightning.load(copy)
 
 
+def test_functions_of_ours_do_not_run(folder: Path, tmp_path: Path) -> None:
+    """As one that writes a file: parts of models are classes, whose making does nothing."""
+    copy, victim = tmp_path / "copy", tmp_path / "victim.txt"
+    shutil.copytree(folder / "labelled", copy)
+    victim.write_text("mine")
+    settings = copy / "settings.yaml"
+    begin, _, rest = settings.read_text().partition("  weight_init:\n")
+    call = f"{{_target_: memcomp_lightning.cli.products.existing, path: {victim}}}"
+    nested = f"{{_target_: memcomp_lightning.files.write_text, path: {call}, text: theirs}}"
+    settings.write_text(f"{begin}  weight_init: {nested}\n" + rest[rest.index("\n  output_init:") + 1 :])
+    with pytest.raises(UserError, match=r"files\.write_text, which is no part of a model of this package"):
+        memcomp_lightning.load(copy)
+    assert victim.read_text() == "mine"
+
+
+@pytest.mark.parametrize("group", ["model", "units", "finetune"])
+def test_every_option_is_a_part_of_a_model(group: str) -> None:
+    """What our own settings name is allowed where runs are loaded."""
+    for path in sorted((Path(memcomp_lightning.__file__).parent / "conf" / group).glob("*.yaml")):
+        check_targets(OmegaConf.to_container(OmegaConf.load(path), resolve=False), group, path)
+
+
 def test_runs_of_earlier_versions(folder: Path, tmp_path: Path) -> None:
     """How weights began is not needed any more; that a part is lost is said."""
     copy = tmp_path / "copy"
@@ -167,6 +191,27 @@ def test_a_run_without_pretraining_has_no_model(folder: Path, command: Command) 
         _ = run.model
     found = command("transform", "alone", "people.csv", "output=none.csv", folder=folder)
     assert "was not pretrained" in found.err
+
+
+def test_a_baseline_has_classes(folder: Path, command: Command) -> None:
+    settings = ["data=table", "data.path=people.csv", "data.columns={label: species, colour: ignore}", *QUICK]
+    found = command("train", *settings, "control=bn_relu", "hydra.run.dir=baseline", folder=folder)
+    assert found.status == 0, found.err
+    found = command("score", "baseline", "people.csv", "output=classes.csv", folder=folder)
+    assert found.status == 0, found.err
+    assert (folder / "classes.csv").read_text().startswith("row,id,colour,species,p(cat),p(dog),class\n")
+    assert "no likelihoods: baseline was not pretrained" in found.out
+
+
+def test_rows_that_complete_a_file_keep_its_other_columns(folder: Path, command: Command) -> None:
+    (folder / "some.csv").write_text("id,sex,age\n7,f,\n8,m,30\n")
+    for n, ids in ((1, ["7", "8"]), (2, ["7", "7", "8", "8"])):
+        found = command("sample", "gaps", "given=some.csv", f"n={n}", f"output=drawn{n}.csv", folder=folder)
+        assert found.status == 0, found.err
+        lines = (folder / f"drawn{n}.csv").read_text().splitlines()
+        assert lines[0].startswith("id,")
+        assert [line.partition(",")[0] for line in lines[1:]] == ids
+        assert all(",30," in f"{line}," for line in lines[1:] if line.startswith("8"))
 
 
 def test_a_run_of_pictures_of_spins_is_loaded(folder: Path, command: Command) -> None:

@@ -71,7 +71,8 @@ def test_a_checkpoint_is_loaded(stopped: Path, run_command: Command) -> None:
     for moved in ("moved.ckpt", "moved.pt"):
         with pytest.raises(UserError, match=r"give the schema of the run, schema=FOLDER/schema\.json"):
             load(moved)
-    again = load("moved.ckpt", schema="run/schema.json")
+    with pytest.warns(LoadWarning, match="its outputs are taken for logits of softmax"):
+        again = load("moved.ckpt", schema="run/schema.json")
     v = run.model.visible.sample(torch.zeros(5, 5), generator=rng.stream(0, "v"))
     assert again.classifier is not None
     assert torch.equal(again.classifier(v), run.classifier(v))

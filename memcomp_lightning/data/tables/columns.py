@@ -210,7 +210,7 @@ def column_of(content: Mapping[str, Any]) -> Column:
 def _rounded(x: NDArray[np.float64], digits: int = 7) -> NDArray[np.float64]:
     """Numbers to so many significant digits, each the float that is nearest to them."""
     size = np.floor(np.log10(np.abs(np.where(np.isfinite(x) & (x != 0), x, 1.0))))
-    places = np.clip(digits - 1 - size, -300, 22)
+    places = np.clip(digits - 1 - size, -300, 300)
     unit = 10.0 ** np.abs(places)  # exact up to 10^22: one rounding each way
     found: NDArray[np.float64] = np.where(places >= 0, np.round(x * unit) / unit, np.round(x / unit) * unit)
     return found

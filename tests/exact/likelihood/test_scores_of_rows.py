@@ -196,6 +196,23 @@ def test_classes_are_those_of_the_classifier() -> None:
     assert (other["p(cat)"] != found.columns["p(cat)"]).tolist() == [False, False, False, True]
 
 
+def test_classes_of_rows_with_gaps_know_both_modes() -> None:
+    """Two modes that sweeps do not leave: all entries 0, or all 1 with .8 of the weight; nothing is known."""
+    schema = TableSchema(tuple(Binary(name, ("no", "yes")) for name in "abcd"), LABEL)
+    model = RBM(visible=schema.units(), n_hidden=2)
+    with torch.no_grad():
+        model.weight[:], model.b[:] = 14.0, -14.0
+        model.c[:] = -28.0 + math.log(4) / 2
+    states = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 4)
+    weight = torch.softmax(-model.free_energy(states).double(), 0)
+    exact = float((weight * torch.softmax(Fixed()(states), -1)[:, 0]).sum().detach())
+    nothing = Rows(torch.zeros(1, 4), torch.tensor([-1]), torch.zeros(1, 4, dtype=torch.bool))
+    run = run_of(model, schema, Fixed())
+    found = [score(run, nothing, seed=seed).columns["p(cat)"][0] for seed in range(5)]
+    assert exact == pytest.approx(0.8 / (1 + math.exp(-1)) + 0.2 / (1 + math.e), abs=1e-3)
+    assert np.mean(found) == pytest.approx(exact, abs=0.05)
+
+
 def test_without_a_model_of_the_data_nothing_fills_the_inputs_of_a_classifier() -> None:
     alone = replace(run_of(DBN(None, [3], visible=SCHEMA.units()), classifier=Fixed()), pretrained=False)
     found = score(alone, rows(gaps=True))

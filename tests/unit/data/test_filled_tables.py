@@ -1,6 +1,7 @@
 """A table with its empty cells filled is the same table: columns, order, texts and types."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,14 @@ import torch
 from pyarrow import parquet
 
 from memcomp_lightning import rng
-from memcomp_lightning.data import PixelLayout, Table
+from memcomp_lightning.data import PixelLayout, Table, TableDataModule
 from memcomp_lightning.data.schema import ImageSchema
 from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.data.tables.filled import filled
 from memcomp_lightning.data.written import in_one_array, write_columns
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.trained.beside import others_of
 
 SCHEMA = TableSchema(
     (
@@ -72,6 +74,48 @@ def test_types_stay(tmp_path: Path, cells: dict[str, Any], expected: list[Any]) 
     written = parquet.read_table(tmp_path / "out.parquet").column(next(iter(cells))).to_pylist()
     assert written == expected
     assert [type(cell) for cell in written] == [type(cell) for cell in expected]
+
+
+def test_numbers_and_times_of_other_columns_keep_their_digits(tmp_path: Path) -> None:
+    """What is found has the seven digits of single precision; what was there has all of its own."""
+    cells = {
+        "id": pa.array([123456789.5, 0.1, 52.520006612]),
+        "seen": pa.array([1577836800_000000000, None, 1577836800_123456789], pa.timestamp("ns")),
+        "height": pa.array([1.23456789012, None, None]),
+    }
+    parquet.write_table(pa.table(cells), tmp_path / "in.parquet")
+    write_columns(filled(tmp_path / "in.parquet", SCHEMA, V[:, :4] + 0.0123456789), tmp_path / "out.csv")
+    assert (tmp_path / "out.csv").read_text().splitlines()[1:] == [
+        "123456789.5,2020-01-01T00:00:00.000000000,1.23456789012,35,blue,true",
+        "0.1,,171.3735,20,red,false",
+        "52.520006612,2020-01-01T00:00:00.123456789,170.1235,30,red,true",
+    ]
+
+
+@pytest.mark.parametrize("x", [0.1, -1e-12, 123456.78, 1e20, 9.99999999, 0.0, math.nan, -math.inf, 3e-20])
+def test_real_cells_have_seven_digits(x: float) -> None:
+    (written,) = Real("x", 0.0, 1.0).write(np.array([x])).tolist()
+    assert written == float(f"{x:.7g}") or x != x
+
+
+def test_a_part_without_rows_is_no_end(tmp_path: Path) -> None:
+    table = pa.table({"x": [0.5, 1.5, 2.5, 4.0] * 5, "y": ["a", "b", "a", "b"] * 5})
+    parts = pa.Table.from_batches(
+        [pa.RecordBatch.from_pylist([], schema=table.schema), *table.to_batches()], schema=table.schema
+    )
+    assert TableDataModule.from_frame(parts).n_train > 0
+
+
+def test_what_is_beside_a_table_is_read_alone(tmp_path: Path) -> None:
+    table = tmp_path / "people.csv"
+    table.write_text("id,age,colour,note\n007,41,red,x\n008,,,y\n")
+    assert {name: column.tolist() for name, column in SCHEMA.others(table).items()} == {
+        "id": ["007", "008"],
+        "note": ["x", "y"],
+    }
+    assert list(others_of(SCHEMA, table, 2)) == ["id", "note"]
+    with pytest.raises(UserError, match="has changed while it was worked on: it had 3 rows"):
+        others_of(SCHEMA, table, 3)
 
 
 def test_arrays_and_pictures_come_back_from_the_file_that_is_written(tmp_path: Path) -> None:

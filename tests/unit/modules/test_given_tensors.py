@@ -1,5 +1,7 @@
 """Tensors and data loaders of tensors in the place of our own batches."""
 
+import math
+
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -9,7 +11,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
 from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.models.units import Categorical
+from memcomp_lightning.models.units import Categorical, Gaussian
 from memcomp_lightning.modules import Classifier, EnergyPretraining
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.training import Greedy, finetune, pretrain
@@ -101,3 +103,9 @@ def test_other_columns_are_refused():
     with pytest.raises(SettingError, match="columns of a batch = 5 is not allowed: expected 6, the visible units"):
         [*pretrain(Greedy(RBM(6, 3)), V[:, :5], CD(k=1), iterations=1, optimizer=sgd)]
     assert len([*updates_of(V)]) == 1
+
+
+def test_an_infinite_value_is_refused_beside_a_missing_one() -> None:
+    v = torch.tensor([[0.5, math.inf], [math.nan, 1.0]])
+    with pytest.raises(SettingError, match=r"v in column 1, row 0 = inf"):
+        as_batch(v, Gaussian(2))

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,14 @@ def test_safetensors_give_the_run_back(tmp_path: Path) -> None:
     assert {name: x.tolist() for name, x in transform(again, ROWS).items()} == {
         name: x.tolist() for name, x in transform(run, ROWS).items()
     }
+
+
+def test_safetensors_keep_that_a_network_was_not_pretrained(tmp_path: Path) -> None:
+    export(replace(of_table(), pretrained=False), tmp_path / "model.safetensors")
+    again = load(tmp_path / "model.safetensors")
+    assert not again.pretrained
+    with pytest.raises(UserError, match="was not pretrained"):
+        _ = again.model
 
 
 def test_a_subclass_of_ones_own_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
