@@ -9,8 +9,9 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.likelihood.missing.choice import MOST_HIDDEN_BITS
 from memcomp_lightning.samplers.parallel_tempering import Ladder, betas
-from memcomp_lightning.trained.chains.exact import MOST_BITS, MOST_HIDDEN_BITS, exact, why_exact
+from memcomp_lightning.trained.chains.exact import MOST_BITS, exact, why_exact
 from memcomp_lightning.trained.chains.measured import (
     N_RENEWALS,
     R_HAT,

@@ -5,6 +5,7 @@ from torch import Generator, Tensor
 
 from memcomp_lightning.likelihood import exact_samples
 from memcomp_lightning.likelihood.missing.base import drawn
+from memcomp_lightning.likelihood.missing.choice import MOST_HIDDEN_BITS
 from memcomp_lightning.models import RBM
 from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.observed import log_weight_of_hidden, visible_field, visible_units_coupled
@@ -13,9 +14,6 @@ from memcomp_lightning.trained.chains.target import Target
 
 MOST_BITS = 16
 """Bits that are enumerated once for all rows."""
-
-MOST_HIDDEN_BITS = 10
-"""Bits of the hidden layer that are enumerated for each row of which something is known."""
 
 NUMBERS = 2**24
 """Numbers of a table that are held at once."""
