@@ -1,0 +1,160 @@
+"""RBMs of tables in files, trained by the bare loop: the updates of memcomp-train without a Lightning trainer."""
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from torch import Generator, nn
+from torch.optim import SGD
+
+from memcomp_lightning import rng
+from memcomp_lightning.data import Table, TableDataModule
+from memcomp_lightning.data.tables import TableData
+from memcomp_lightning.models import RBM, BoltzmannMachine, start_at_means
+from memcomp_lightning.models.units import Units
+from memcomp_lightning.objective import Centring
+from memcomp_lightning.samplers import PCD, ClampedGibbs, NegativePhaseSampler
+from memcomp_lightning.trained.run import Run
+from memcomp_lightning.training import L1, Boltzmann, DivergedError, Greedy, PretrainingStage, pretrain
+from memcomp_lightning.training.schedules import LearningRateDecay
+
+
+def restricted(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
+    """An RBM."""
+    return Greedy(RBM(visible=visible, n_hidden=n_hidden, generator=generator))
+
+
+def potts(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
+    """All pairs of sites coupled, without hidden units; two sweeps draw what is missing of a row."""
+    model = BoltzmannMachine(visible=visible, n_hidden=n_hidden, generator=generator)
+    return Boltzmann(model, positive=ClampedGibbs(k=2))
+
+
+def coupled(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
+    """An RBM with couplings among its visible sites as well, but for two real ones, which must not be coupled."""
+    n, n_all = visible.n_sites, visible.n_sites + n_hidden
+    real = torch.ones(visible.n, dtype=torch.bool)
+    real[visible.bits().at] = False
+    alone = set(visible.site_of()[real].tolist())
+    apart = [alone, set(range(n, n_all))]
+    pairs = [pair for pair in combinations(range(n_all), 2) if not any(sites.issuperset(pair) for sites in apart)]
+    return Boltzmann(BoltzmannMachine(visible=visible, n_hidden=n_hidden, connectivity=pairs, generator=generator))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Of a training.
+
+    Attributes:
+        stage: Which model is trained.
+        sampler: Of the negative phase.
+        n_hidden: Hidden units in {0, 1}.
+        rate: Learning rate of the first pass; a falling one ends at a hundredth of it in the last of ``passes``.
+        passes: Passes over the training rows.
+        falling: Whether the rate falls.
+        l1: Strength of the L1 penalty.
+        batch: Rows an update.
+    """
+
+    stage: Callable[[Units, int, Generator], PretrainingStage] = restricted
+    sampler: NegativePhaseSampler = field(default_factory=PCD)
+    n_hidden: int
+    rate: float
+    passes: int
+    falling: bool = True
+    l1: float = 0.0
+    batch: int = 20
+
+    def __str__(self) -> str:
+        hidden = f"{self.n_hidden} hidden, " if self.n_hidden else ""
+        penalty = f", L1 {self.l1:g}" if self.l1 else ""
+        return f"{hidden}rate {self.rate:g}{penalty}"
+
+
+class Chosen(NamedTuple):
+    """The best of several trainings.
+
+    Attributes:
+        settings: Of the training.
+        passes: After which it was best.
+        quality: Of the run, the higher the better.
+        run: With the weights of that time.
+    """
+
+    settings: Settings
+    passes: int
+    quality: float
+    run: Run
+
+
+def read(folder: Path, **parts: Any) -> TableData:
+    """Frames, or arrays with NaN where a cell is missing, written to files and read again, as memcomp-train does.
+
+    Args:
+        folder: Where the files are written.
+        parts: The rows to ``train`` on, and those of ``validation`` and ``test``.
+    """
+    files = {}
+    for name, part in parts.items():
+        if isinstance(part, np.ndarray):
+            np.save(folder / f"{name}.npy", part)
+            files[name] = str(folder / f"{name}.npy")
+        else:
+            part.to_csv(folder / f"{name}.csv", index=False)
+            files[name] = str(folder / f"{name}.csv")
+    return Table(path=files.pop("train"), **files).load()
+
+
+def trained(table: TableData, settings: Settings, *, seed: int = 0, looks: int = 1) -> Iterator[tuple[int, Run]]:
+    """Passes done and the run, which goes on being trained, ``looks`` times in all.
+
+    Raises:
+        DivergedError: A parameter left the finite numbers.
+    """
+    data = TableDataModule(table, batch_size=settings.batch, seed=seed)
+    stage = settings.stage(data.units, settings.n_hidden, rng.stream(seed, "weights"))
+    model, some = stage.phases[0].model, data.some_train()
+    start_at_means(model, some.v, some.observed)
+    run = Run(Path("table"), cast(nn.Module, model), schema=table.schema)
+    for done in pretrain(
+        stage,
+        data.train_dataloader(),
+        settings.sampler,
+        iterations=settings.passes,
+        optimizer=partial(SGD, lr=settings.rate),
+        schedules=[LearningRateDecay(settings.passes)] if settings.falling else [],
+        centring=Centring(),
+        penalties=[L1(settings.l1)] if settings.l1 else [],
+        seed=seed,
+    ):
+        if done.number % (settings.passes // looks) == 0:
+            yield done.number, run
+
+
+def choose(
+    table: TableData,
+    grid: Sequence[Settings],
+    quality: Callable[[Run], float],
+    *,
+    seed: int = 0,
+    looks: int = 1,
+) -> Chosen:
+    """Train with each of the settings and keep the best run; a training that diverges is none."""
+    best: Chosen | None = None
+    for settings in grid:
+        try:
+            for passes, run in trained(table, settings, seed=seed, looks=looks):
+                found = quality(run)
+                if np.isfinite(found) and (best is None or found > best.quality):
+                    kept = replace(run, network=copy.deepcopy(run.network))
+                    best = Chosen(settings, passes, found, kept)
+        except DivergedError:
+            continue
+    assert best is not None, "all trainings diverged"
+    return best
