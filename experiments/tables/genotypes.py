@@ -28,9 +28,29 @@ from memcomp_lightning.trained.imputation import impute
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import complete_values
 
+
+class Forest(NamedTuple):
+    """Settings of an IsolationForest.
+
+    Attributes:
+        n_trees: Number of trees.
+        n_rows: Training rows of each tree, at most.
+        share: Of the columns, of each tree.
+    """
+
+    n_trees: int
+    n_rows: int
+    share: float
+
+
 GAPS = (0.05, 0.2)
 SEEDS, TUNING = (0, 1, 2, 3, 4, 5), 100
-NEIGHBOURS = (5, 10, 20, 50)
+NEIGHBOURS = (3, 5, 10, 20, 50)
+PREDICTORS = (10, 30, None)
+"""Columns of which IterativeImputer predicts each one; None is all."""
+FORESTS = [
+    Forest(n_trees, n_rows, share) for n_trees in (100, 500) for n_rows in (256, 1500) for share in (0.2, 1.0)
+]
 GRID = [
     Settings(n_hidden=n_hidden, rate=rate, l1=l1, passes=40)
     for n_hidden, rate, l1 in ((200, 0.2, 0.001), (200, 0.4, 0.001), (200, 0.4, 0.002), (100, 0.4, 0.002))
@@ -142,6 +162,10 @@ def nearest(k: int) -> KNNImputer:
     return KNNImputer(n_neighbors=k, weights="distance")
 
 
+def iterative(n_predictors: int | None, seed: int) -> IterativeImputer:
+    return IterativeImputer(max_iter=5, n_nearest_features=n_predictors, random_state=seed)
+
+
 def correct(filled: Filled, cells: Cells) -> float:
     """Share of the gaps with the right value."""
     return float((filled.value == cells.true[~cells.observed]).mean())
@@ -180,9 +204,12 @@ def neighbour_distance(data: Data, k: int) -> Callable[[Genotypes], Matrix]:
     return lambda rows: np.asarray(near.kneighbors(rows.astype(float))[0].mean(1))
 
 
-def isolation(data: Data, seed: int) -> Callable[[Genotypes], Matrix]:
-    """Of a forest at its defaults, which knows gaps."""
-    forest = IsolationForest(random_state=seed).fit(data.train.gapped)
+def isolation(data: Data, settings: Forest, seed: int) -> Callable[[Genotypes], Matrix]:
+    """Of a forest, which knows gaps."""
+    n_rows = min(settings.n_rows, len(data.train.true))
+    forest = IsolationForest(
+        n_estimators=settings.n_trees, max_samples=n_rows, max_features=settings.share, random_state=seed
+    ).fit(data.train.gapped)
     return lambda rows: np.asarray(-forest.score_samples(rows.astype(float)))
 
 
@@ -199,12 +226,16 @@ class Tuned(NamedTuple):
     Attributes:
         settings: Of the RBM, by the log loss of gaps in validation rows.
         k_fill: Neighbours that fill gaps, by the share that is right in validation rows.
+        n_predictors: Columns of which IterativeImputer predicts each one, by the same.
         k_near: Neighbours that tell anomalies, by the anomalies of that table.
+        forest: Of an IsolationForest, by the same.
     """
 
     settings: Settings
     k_fill: int
+    n_predictors: int | None
     k_near: int
+    forest: Forest
 
     @classmethod
     def on(cls, data: Data, grid: Sequence[Settings], neighbours: Sequence[int]) -> "Tuned":
@@ -213,14 +244,33 @@ class Tuned(NamedTuple):
         def quality(run: Run) -> float:
             return -log_loss(by_run(run, data.table.validation, cells))
 
-        def filled(k: int) -> float:
-            return correct(rounded(nearest(k), data, cells), cells)
+        def filled(imputer: Any) -> float:
+            return correct(rounded(imputer, data, cells), cells)
 
-        def area(k: int) -> float:
-            return sum(auc(data, neighbour_distance(data, k)).values())
+        def area(surprise: Callable[[Genotypes], Matrix]) -> float:
+            return sum(auc(data, surprise).values())
 
-        best = choose(data.table, grid, quality, seed=TUNING)
-        return cls(best.settings, max(neighbours, key=filled), max(neighbours, key=area))
+        return cls(
+            choose(data.table, grid, quality, seed=TUNING).settings,
+            max(neighbours, key=lambda k: filled(nearest(k))),
+            max(PREDICTORS, key=lambda n: filled(iterative(n, TUNING))),
+            max(neighbours, key=lambda k: area(neighbour_distance(data, k))),
+            max(FORESTS, key=lambda forest: area(isolation(data, forest, TUNING))),
+        )
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What was chosen, by method."""
+        columns = "all" if self.n_predictors is None else self.n_predictors
+        forest = (
+            f"{self.forest.n_trees} trees of {self.forest.n_rows} rows, {self.forest.share:.0%} of the columns"
+        )
+        return {
+            "nearest neighbours": f"k = {self.k_fill} to fill, {self.k_near} to tell",
+            "IterativeImputer": f"of {columns} columns",
+            "IsolationForest": forest,
+            "RBM": f"{self.settings}, {self.settings.passes} passes",
+        }
 
 
 class Found(NamedTuple):
@@ -252,11 +302,11 @@ def nearest_rows(data: Data, tuned: Tuned, seed: int) -> Found:
 
 
 def iterations(data: Data, tuned: Tuned, seed: int) -> Found:
-    return Found(rounded(IterativeImputer(max_iter=5, random_state=seed), data, data.test))
+    return Found(rounded(iterative(tuned.n_predictors, seed), data, data.test))
 
 
 def trees(data: Data, tuned: Tuned, seed: int) -> Found:
-    return Found(None, auc(data, isolation(data, seed)))
+    return Found(None, auc(data, isolation(data, tuned.forest, seed)))
 
 
 def rbm(data: Data, tuned: Tuned, seed: int) -> Found:
@@ -289,7 +339,7 @@ def measure(*, quick: bool) -> Iterator[dict[str, Any]]:
     for gaps in GAPS[1:] if quick else GAPS:
         tuned = Tuned.on(Data.draw(TUNING, gaps, sizes, **shape), grid, neighbours)
         tables = [Data.draw(seed, gaps, sizes, **shape) for seed in seeds]
-        notes = {"RBM": str(tuned.settings), "nearest neighbours": f"k = {tuned.k_fill}, {tuned.k_near}"}
+        notes = tuned.notes
         for name, method in METHODS.items():
             found = [method(data, tuned, seed).numbers(data) for data, seed in zip(tables, seeds, strict=True)]
             medians = {what: shown([numbers[what] for numbers in found]) for what in found[0]}

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "tables"))
 import mixed
 from conditional_gaussian import N_BITS, N_REAL, SIZES, MixedTable
 from marginals import agreement
+from mixture_of_classes import fit
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +75,48 @@ def test_samples_are_compared_by_shares_and_by_correlations():
     assert agreement(rarer, rows, schema).marginal == pytest.approx(share, abs=1e-6)
 
 
+@pytest.fixture(scope="module")
+def rows_of_classes(known):
+    rows = known.sample(3000, rng.numpy_stream(2, "rows"))
+    words = [rows[f"bit {j}"].eq("yes").astype(int) for j in range(N_BITS)]
+    words += [rows[f"word {j}"].str[1:].astype(int) for j in range(len(SIZES))]
+    real = rows[[f"real {j}" for j in range(N_REAL)]].to_numpy()
+    scale = real.std(0)
+    density = known.log_density(rows) + np.log(scale).sum()
+    return np.stack(words, axis=-1), (real - real.mean(0)) / scale, density, [2] * N_BITS + list(SIZES)
+
+
+def test_a_mixture_comes_near_a_density_that_is_one(rows_of_classes):
+    words, real, density, sizes = rows_of_classes
+    generator = rng.numpy_stream(0, "mixture")
+    gaps = []
+    for k in (1, 6):  # two classes, each of them shifted by a word of three values
+        found = fit(words[:2000], real[:2000], sizes, n_classes=k, generator=generator)
+        gaps.append(density[2000:].mean() - found.log_density(words[2000:], real[2000:]).mean())
+    assert 0 < gaps[1] < 0.15 < 1 < gaps[0]
+
+
+def test_rows_of_a_mixture_have_its_density(rows_of_classes):
+    words, real, _, sizes = rows_of_classes
+    found = fit(words, real, sizes, n_classes=6, generator=rng.numpy_stream(0, "mixture"))
+    drawn = found.sample(20_000, rng.numpy_stream(1, "drawn"))
+    # The mean of log p is minus the entropy, of both what is fitted and what is drawn if these are alike.
+    assert found.log_density(*drawn).mean() == pytest.approx(found.log_density(words, real).mean(), abs=0.15)
+    log_p = found.log_density(words[:1], real[:1])
+    total = 0.0
+    for z, weight in enumerate(np.exp(found.log_weight)):
+        p = weight * np.prod(
+            [np.exp(log_word[z, state]) for log_word, state in zip(found.log_word, words[0], strict=True)]
+        )
+        total += p * multivariate_normal(found.mean[z], found.factor[z] @ found.factor[z].T).pdf(real[0])
+    assert log_p[0] == pytest.approx(np.log(total))
+
+
 def test_all_models_are_measured():
     rows = {(row["table"], row["model"]): row for row in mixed.measure(quick=True)}
     assert [model for table, model in rows if table == "mixed"] == [
-        *("independent columns", "RBM", "RBM with visible couplings", "the true density", "training rows")
+        *("independent columns", "mixture of classes", "RBM at the defaults", "RBM", "RBM with visible couplings"),
+        *("the true density", "training rows"),
     ]
 
     def number(table, model, column):
