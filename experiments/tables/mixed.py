@@ -6,7 +6,7 @@ scikit-learn. Densities are those of the user's columns, whatever the columns ar
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,7 +143,7 @@ def independent(split: Split, n_samples: int) -> Model:
     return Model(float(log_p.mean()) - table.schema.log_scale, torch.tensor(drawn))
 
 
-def gaussian_mixture(split: Split, n_samples: int) -> Model:
+def gaussian_mixture(components: Sequence[int], split: Split, n_samples: int) -> Model:
     """By EM, of the components, covariances and floor of variances that are best on validation rows."""
     table = split.table
     assert table.validation is not None
@@ -151,7 +151,7 @@ def gaussian_mixture(split: Split, n_samples: int) -> Model:
     best = max(
         (
             GaussianMixture(k, covariance_type=kind, reg_covar=least, random_state=split.seed).fit(train)
-            for k in COMPONENTS
+            for k in components
             for kind in COVARIANCES
             for least in LEAST
         ),
@@ -201,9 +201,9 @@ def of_run(run: Run, split: Split, n_samples: int, settings: str) -> Model:
     return Model(mean, drawn.v, settings, found.log_z, drawn.mixing.method)
 
 
-def as_typed(split: Split, n_samples: int) -> Model:
-    """At the defaults of the command."""
-    *_, (_, run) = trained(split.table, AS_TYPED, seed=split.seed)
+def as_typed(settings: Settings, split: Split, n_samples: int) -> Model:
+    """At settings that nobody chose."""
+    *_, (_, run) = trained(split.table, settings, seed=split.seed)
     return of_run(run, split, n_samples, "")
 
 
@@ -261,22 +261,36 @@ def of_log_z(found: Sequence[LogZ]) -> str:
     return error if len(annealed) == len(found) else f"{error}; {len(found) - len(annealed)} of {len(found)} exact"
 
 
-def made(
-    grids: dict[str, Sequence[Settings]], seeds: Sequence[int], sizes: Sizes, n_samples: int
-) -> Iterator[dict[str, Any]]:
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is run: tables, and the settings that are compared on validation rows."""
+
+    seeds: Sequence[int] = SEEDS
+    sizes: Sizes = field(default_factory=Sizes)
+    n_samples: int = N_SAMPLES
+    typed: Settings = AS_TYPED
+    of_mixed: Sequence[Settings] = field(default_factory=lambda: OF_MIXED)
+    coupled: Sequence[Settings] = field(default_factory=lambda: COUPLED)
+    shipped: Sequence[str] = field(default_factory=lambda: list(SHIPPED))
+    of_shipped: Sequence[Settings] = field(default_factory=lambda: OF_SHIPPED)
+    components: Sequence[int] = COMPONENTS
+
+
+def made(plan: Plan) -> Iterator[dict[str, Any]]:
     """Rows of the table whose density is known; settings are chosen on another such table."""
-    tuning, splits = mixed_table(TUNING, sizes), [mixed_table(seed, sizes) for seed in seeds]
+    n_samples = plan.n_samples
+    tuning, splits = mixed_table(TUNING, plan.sizes), [mixed_table(seed, plan.sizes) for seed in plan.seeds]
     base = [independent(split, n_samples) for split in splits]
     k = classes_on(tuning)
     fixed: dict[str, tuple[Method, str]] = {
         "independent columns": (independent, ""),
         "mixture of classes": (partial(of_mixture, k), f"{k} classes"),
-        "RBM at the defaults": (as_typed, f"{AS_TYPED}, {AS_TYPED.passes} passes"),
+        "RBM at the defaults": (partial(as_typed, plan.typed), f"{plan.typed}, {plan.typed.passes} passes"),
     }
     for name, (method, settings) in fixed.items():
         models = [method(split, n_samples) for split in splits]
         yield {"table": "mixed", "model": name, **row_of(models, splits, base), "settings": settings}
-    for name, grid in grids.items():
+    for name, grid in {"RBM": plan.of_mixed, "RBM with visible couplings": plan.coupled}.items():
         best = choose(tuning.table, grid, on_validation(tuning.table), seed=TUNING, looks=LOOKS)
         models = [with_settings(best, split, n_samples) for split in splits]
         settings = f"{best.settings}, {best.passes} passes"
@@ -286,15 +300,15 @@ def made(
         yield {"table": "mixed", "model": name, **row_of(models, splits, base)}
 
 
-def shipped(name: str, grid: Sequence[Settings], seeds: Sequence[int], n_samples: int) -> Iterator[dict[str, Any]]:
+def of_scikit_learn(name: str, plan: Plan) -> Iterator[dict[str, Any]]:
     """Rows of a table of scikit-learn; settings are chosen on the validation rows of each split."""
-    splits = [shipped_table(name, seed) for seed in seeds]
+    n_samples, splits = plan.n_samples, [shipped_table(name, seed) for seed in plan.seeds]
     base = [independent(split, n_samples) for split in splits]
     methods: dict[str, Method] = {
         "independent columns": independent,
-        "GaussianMixture": gaussian_mixture,
-        "RBM at the defaults": as_typed,
-        "RBM": partial(chosen_here, grid),
+        "GaussianMixture": partial(gaussian_mixture, plan.components),
+        "RBM at the defaults": partial(as_typed, plan.typed),
+        "RBM": partial(chosen_here, plan.of_shipped),
         "training rows": training_rows,
     }
     for model, method in methods.items():
@@ -305,12 +319,20 @@ def shipped(name: str, grid: Sequence[Settings], seeds: Sequence[int], n_samples
 
 def measure(*, quick: bool) -> Iterator[dict[str, Any]]:
     """A row for each table and model."""
+    plan = Plan()
     if quick:
-        small = [replace(grid[0], n_hidden=2, rate=0.4, passes=LOOKS) for grid in (OF_MIXED, COUPLED, OF_SHIPPED)]
-        grids = {"RBM": small[:1], "RBM with visible couplings": small[1:2]}
-        yield from made(grids, SEEDS[:2], Sizes(300, 50, 200), 200)
-        yield from shipped("wine", small[2:], SEEDS[:2], 200)
-        return
-    yield from made({"RBM": OF_MIXED, "RBM with visible couplings": COUPLED}, SEEDS, Sizes(), N_SAMPLES)
-    for name in SHIPPED:
-        yield from shipped(name, OF_SHIPPED, SEEDS, N_SAMPLES)
+        small = Settings(n_hidden=2, rate=0.4, passes=LOOKS)
+        plan = Plan(
+            seeds=SEEDS[:2],
+            sizes=Sizes(300, 50, 200),
+            n_samples=200,
+            typed=small,
+            of_mixed=[small],
+            coupled=[replace(COUPLED[0], n_hidden=2, rate=0.4, passes=LOOKS)],
+            shipped=["wine"],
+            of_shipped=[small],
+            components=(1, 2),
+        )
+    yield from made(plan)
+    for name in plan.shipped:
+        yield from of_scikit_learn(name, plan)

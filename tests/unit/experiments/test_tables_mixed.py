@@ -93,7 +93,7 @@ def test_a_mixture_comes_near_a_density_that_is_one(rows_of_classes):
     for k in (1, 6):  # two classes, each of them shifted by a word of three values
         found = fit(words[:2000], real[:2000], sizes, n_classes=k, generator=generator)
         gaps.append(density[2000:].mean() - found.log_density(words[2000:], real[2000:]).mean())
-    assert 0 < gaps[1] < 0.15 < 1 < gaps[0]
+    assert 0 < gaps[1] < 0.4 < 1 < gaps[0]
 
 
 def test_rows_of_a_mixture_have_its_density(rows_of_classes):
