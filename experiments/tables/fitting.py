@@ -13,7 +13,7 @@ import torch
 from torch import Generator, nn
 from torch.optim import SGD
 
-from memcomp_lightning import rng
+from memcomp_lightning import defaults, rng
 from memcomp_lightning.data import Table, TableDataModule
 from memcomp_lightning.data.tables import TableData
 from memcomp_lightning.models import RBM, BoltzmannMachine, start_at_means
@@ -75,6 +75,10 @@ class Settings:
         hidden = f"{self.n_hidden} hidden, " if self.n_hidden else ""
         penalty = f", L1 {self.l1:g}" if self.l1 else ""
         return f"{hidden}rate {self.rate:g}{penalty}"
+
+
+AS_TYPED = Settings(n_hidden=32, rate=defaults.LEARNING_RATE, passes=defaults.PASSES, falling=False)
+"""What ``memcomp-train data=table data.path=...`` does without further settings."""
 
 
 class Chosen(NamedTuple):

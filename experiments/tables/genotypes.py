@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from fitting import Settings, choose, read, trained
+from fitting import AS_TYPED, Settings, choose, read, trained
 from haplotypes import N_VALUES, Genotypes, Matrix, Panel
 from medians import shown
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ FORESTS = [
 ]
 GRID = [
     Settings(n_hidden=n_hidden, rate=rate, l1=l1, passes=40)
-    for n_hidden, rate, l1 in ((200, 0.2, 0.001), (200, 0.4, 0.001), (200, 0.4, 0.002), (100, 0.4, 0.002))
+    for n_hidden, rate, l1 in ((200, 0.4, 0.001), (200, 0.4, 0.002), (200, 0.8, 0.002), (100, 0.8, 0.001))
 ]
 
 
@@ -269,6 +269,7 @@ class Tuned(NamedTuple):
             "nearest neighbours": f"k = {self.k_fill} to fill, {self.k_near} to tell",
             "IterativeImputer": f"of {columns} columns",
             "IsolationForest": forest,
+            "RBM at the defaults": f"{AS_TYPED}, {AS_TYPED.passes} passes",
             "RBM": f"{self.settings}, {self.settings.passes} passes",
         }
 
@@ -310,7 +311,16 @@ def trees(data: Data, tuned: Tuned, seed: int) -> Found:
 
 
 def rbm(data: Data, tuned: Tuned, seed: int) -> Found:
-    *_, (_, run) = trained(data.table, tuned.settings, seed=seed)
+    return of_settings(tuned.settings, data, seed)
+
+
+def untuned_rbm(data: Data, tuned: Tuned, seed: int) -> Found:
+    return of_settings(AS_TYPED, data, seed)
+
+
+def of_settings(settings: Settings, data: Data, seed: int) -> Found:
+    """An RBM of the training rows."""
+    *_, (_, run) = trained(data.table, settings, seed=seed)
     return Found(by_run(run, data.table.test, data.test), auc(data, free_energy(run)))
 
 
@@ -325,6 +335,7 @@ METHODS: dict[str, Callable[[Data, Tuned, int], Found]] = {
     "nearest neighbours": nearest_rows,
     "IterativeImputer": iterations,
     "IsolationForest": trees,
+    "RBM at the defaults": untuned_rbm,
     "RBM": rbm,
     "the true distribution": truth,
 }

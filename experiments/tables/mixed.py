@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from conditional_gaussian import MixedTable
-from fitting import Chosen, Settings, choose, coupled, read, trained
+from fitting import AS_TYPED, Chosen, Settings, choose, coupled, read, trained
 from marginals import agreement
 from medians import shown
 from mixture_of_classes import Classes, States, fit
@@ -24,7 +24,7 @@ from sklearn.datasets import load_breast_cancer, load_wine
 from sklearn.mixture import GaussianMixture
 from torch import Tensor
 
-from memcomp_lightning import defaults, rng
+from memcomp_lightning import rng
 from memcomp_lightning.data.tables import TableData
 from memcomp_lightning.data.tables.columns import Words
 from memcomp_lightning.trained.partition import Annealing, LogZ
@@ -40,8 +40,6 @@ QUICKLY = Annealing(n_betas=500, most_betas=500)
 SHIPPED = {"breast cancer": load_breast_cancer, "wine": load_wine}
 LOOKS = 6
 """How often a model is looked at in its training: it is taken where validation rows are likeliest."""
-AS_TYPED = Settings(n_hidden=32, rate=defaults.LEARNING_RATE, passes=defaults.PASSES, falling=False)
-"""What ``memcomp-train data=table data.path=...`` does without further settings."""
 OF_MIXED = [Settings(n_hidden=n, rate=rate, passes=90) for n in (8, 16, 50) for rate in (0.1, 0.2, 0.4)]
 COUPLED = [
     # Sites that are coupled are drawn one after the other, so that updates take longer: fewer of them.

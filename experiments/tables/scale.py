@@ -17,9 +17,6 @@ N_REAL = N_CATEGORY = 50
 N_FACTORS, AT_ONCE = 5, 50_000
 WORDS = np.array(list("abcdefgh"))
 
-CALLBACKS = "callbacks=minimal"
-"""The default ones estimate log Z and draw figures, which is a matter of the model and not of the rows."""
-
 
 def write(path: Path, n: int, *, n_real: int = N_REAL, n_category: int = N_CATEGORY) -> None:
     """Numbers that are sums of a few factors and noise, and categories of 2 to 8 words that follow them, too."""
@@ -55,7 +52,7 @@ def measure(*, quick: bool) -> Iterator[dict[str, Any]]:
         folder = Path(name)
         write(folder / "rows.csv", n, **shape)
         size = f"{(folder / 'rows.csv').stat().st_size / 1e6:.0f} MB"
-        settings = ["pretrain.iterations=1", "pretrain.batch_size=1000", CALLBACKS, "hydra.run.dir=run"]
+        settings = ["pretrain.iterations=1", "pretrain.batch_size=1000", "hydra.run.dir=run"]
         used = command("train", "data=table", "data.path=rows.csv", *settings, folder=folder)
         yield row(f"read {n:,} rows of {sum(shape.values()) or 100} columns, train on them once", used, file=size)
         used = command("sample", "run", f"n={drawn}", "output=drawn.csv", folder=folder)
