@@ -10,6 +10,7 @@ from memcomp_lightning.data.tables import Table
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "tables"))
 import alignments
+import commands
 import scale
 
 
@@ -30,3 +31,18 @@ def test_a_sequence_of_another_length_or_letter_is_not_valid(tmp_path):
 def test_independent_sites_have_the_likelihood_of_counts():
     train, test = np.array([[0, 1], [0, 1], [1, 1]]), np.array([[0, 0]])
     assert alignments.alone(train, test, 2) == pytest.approx(np.log(3 / 5 * 1 / 5))
+
+
+def test_r_hat_is_read_from_what_the_command_says():
+    used = commands.Used(
+        1.0, 1.0, 0.1, "10 rows in 1 s: a.fasta\n  method           Gibbs chains\n  R-hat            1.234\n"
+    )
+    assert alignments.r_hat(used) == "1.234"
+    assert alignments.r_hat(used._replace(out="  method           exact, independent rows\n")) == ""
+
+
+def test_a_command_is_measured(tmp_path):
+    used = commands.command("sample", "--help", folder=tmp_path)
+    assert "method" in used.out
+    assert used.core_seconds > 0.1
+    assert 0.05 < used.gibibytes < 4
