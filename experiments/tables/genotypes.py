@@ -53,7 +53,10 @@ FORESTS = [
 ]
 GRID = [
     Settings(n_hidden=n_hidden, rate=rate, l1=l1, passes=40)
-    for n_hidden, rate, l1 in ((200, 0.4, 0.001), (200, 0.4, 0.002), (200, 0.8, 0.002), (100, 0.8, 0.001))
+    for n_hidden, rate, l1 in (
+        *((200, 0.2, 0.001), (200, 0.4, 0.001), (200, 0.4, 0.002), (200, 0.4, 0.004), (200, 0.8, 0.002)),
+        *((100, 0.4, 0.002), (100, 0.8, 0.004)),
+    )
 ]
 
 
@@ -224,7 +227,7 @@ class Tuned(NamedTuple):
     """What is chosen on a table that is not measured.
 
     Attributes:
-        settings: Of the RBM, by the log loss of gaps in validation rows.
+        settings: Of the RBM.
         k_fill: Neighbours that fill gaps, by the share that is right in validation rows.
         n_predictors: Columns of which IterativeImputer predicts each one, by the same.
         k_near: Neighbours that tell anomalies, by the anomalies of that table.
@@ -238,11 +241,8 @@ class Tuned(NamedTuple):
     forest: Forest
 
     @classmethod
-    def on(cls, data: Data, grid: Sequence[Settings], neighbours: Sequence[int]) -> "Tuned":
+    def on(cls, data: Data, settings: Settings, neighbours: Sequence[int]) -> "Tuned":
         cells = data.validation
-
-        def quality(run: Run) -> float:
-            return -log_loss(by_run(run, data.table.validation, cells))
 
         def filled(imputer: Any) -> float:
             return correct(rounded(imputer, data, cells), cells)
@@ -251,7 +251,7 @@ class Tuned(NamedTuple):
             return sum(auc(data, surprise).values())
 
         return cls(
-            choose(data.table, grid, quality, seed=TUNING).settings,
+            settings,
             max(neighbours, key=lambda k: filled(nearest(k))),
             max(PREDICTORS, key=lambda n: filled(iterative(n, TUNING))),
             max(neighbours, key=lambda k: area(neighbour_distance(data, k))),
@@ -272,6 +272,15 @@ class Tuned(NamedTuple):
             "RBM at the defaults": f"{AS_TYPED}, {AS_TYPED.passes} passes",
             "RBM": f"{self.settings}, {self.settings.passes} passes",
         }
+
+
+def chosen(data: Data, grid: Sequence[Settings]) -> Settings:
+    """Settings of the RBM with the least log loss of gaps in validation rows."""
+
+    def quality(run: Run) -> float:
+        return -log_loss(by_run(run, data.table.validation, data.validation))
+
+    return choose(data.table, grid, quality, seed=TUNING).settings
 
 
 class Found(NamedTuple):
@@ -347,8 +356,11 @@ def measure(*, quick: bool) -> Iterator[dict[str, Any]]:
     if quick:
         sizes, seeds, shape = Sizes(80, 20, 30), SEEDS[:2], {"n_blocks": 2, "n_sites_of_block": 4}
         grid, neighbours = [Settings(n_hidden=8, rate=rate, l1=0.001, passes=2) for rate in (0.2, 0.4)], (5, 10)
+    settings: Settings | None = None
     for gaps in GAPS[1:] if quick else GAPS:
-        tuned = Tuned.on(Data.draw(TUNING, gaps, sizes, **shape), grid, neighbours)
+        tuning = Data.draw(TUNING, gaps, sizes, **shape)
+        settings = settings or chosen(tuning, grid)  # of the first share of gaps, for all
+        tuned = Tuned.on(tuning, settings, neighbours)
         tables = [Data.draw(seed, gaps, sizes, **shape) for seed in seeds]
         notes = tuned.notes
         for name, method in METHODS.items():
