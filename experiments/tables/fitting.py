@@ -2,58 +2,30 @@
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from torch import Generator, nn
 from torch.optim import SGD
 
 from memcomp_lightning import defaults, rng
 from memcomp_lightning.data import Table, TableDataModule
 from memcomp_lightning.data.tables import TableData
-from memcomp_lightning.models import RBM, BoltzmannMachine, start_at_means
-from memcomp_lightning.models.units import Units
+from memcomp_lightning.models import RBM, start_at_means
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.samplers import PCD, ClampedGibbs, NegativePhaseSampler
+from memcomp_lightning.samplers import PCD
 from memcomp_lightning.trained.run import Run
-from memcomp_lightning.training import L1, Boltzmann, DivergedError, Greedy, PretrainingStage, pretrain
+from memcomp_lightning.training import L1, DivergedError, Greedy, pretrain
 from memcomp_lightning.training.schedules import LearningRateDecay
-
-
-def restricted(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
-    """An RBM."""
-    return Greedy(RBM(visible=visible, n_hidden=n_hidden, generator=generator))
-
-
-def potts(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
-    """All pairs of sites coupled, without hidden units; two sweeps draw what is missing of a row."""
-    model = BoltzmannMachine(visible=visible, n_hidden=n_hidden, generator=generator)
-    return Boltzmann(model, positive=ClampedGibbs(k=2))
-
-
-def coupled(visible: Units, n_hidden: int, generator: Generator) -> PretrainingStage:
-    """An RBM with couplings among its visible sites as well, but for two real ones, which must not be coupled."""
-    n, n_all = visible.n_sites, visible.n_sites + n_hidden
-    real = torch.ones(visible.n, dtype=torch.bool)
-    real[visible.bits().at] = False
-    alone = set(visible.site_of()[real].tolist())
-    apart = [alone, set(range(n, n_all))]
-    pairs = [pair for pair in combinations(range(n_all), 2) if not any(sites.issuperset(pair) for sites in apart)]
-    return Boltzmann(BoltzmannMachine(visible=visible, n_hidden=n_hidden, connectivity=pairs, generator=generator))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Of a training.
+    """Of the training of an RBM.
 
     Attributes:
-        stage: Which model is trained.
-        sampler: Of the negative phase.
         n_hidden: Hidden units in {0, 1}.
         rate: Learning rate of the first pass; a falling one ends at a hundredth of it in the last of ``passes``.
         passes: Passes over the training rows.
@@ -62,8 +34,6 @@ class Settings:
         batch: Rows an update.
     """
 
-    stage: Callable[[Units, int, Generator], PretrainingStage] = restricted
-    sampler: NegativePhaseSampler = field(default_factory=PCD)
     n_hidden: int
     rate: float
     passes: int
@@ -72,9 +42,8 @@ class Settings:
     batch: int = 20
 
     def __str__(self) -> str:
-        hidden = f"{self.n_hidden} hidden, " if self.n_hidden else ""
         penalty = f", L1 {self.l1:g}" if self.l1 else ""
-        return f"{hidden}rate {self.rate:g}{penalty}"
+        return f"{self.n_hidden} hidden, rate {self.rate:g}{penalty}"
 
 
 AS_TYPED = Settings(n_hidden=32, rate=defaults.LEARNING_RATE, passes=defaults.PASSES, falling=False)
@@ -122,14 +91,14 @@ def trained(table: TableData, settings: Settings, *, seed: int = 0, looks: int =
         DivergedError: A parameter left the finite numbers.
     """
     data = TableDataModule(table, batch_size=settings.batch, seed=seed)
-    stage = settings.stage(data.units, settings.n_hidden, rng.stream(seed, "weights"))
-    model, some = stage.phases[0].model, data.some_train()
-    start_at_means(model, some.v, some.observed)
-    run = Run(Path("table"), cast(nn.Module, model), schema=table.schema)
+    rbm = RBM(visible=data.units, n_hidden=settings.n_hidden, generator=rng.stream(seed, "weights"))
+    some = data.some_train()
+    start_at_means(rbm, some.v, some.observed)
+    run = Run(Path("table"), rbm, schema=table.schema)
     for done in pretrain(
-        stage,
+        Greedy(rbm),
         data.train_dataloader(),
-        settings.sampler,
+        PCD(),
         iterations=settings.passes,
         optimizer=partial(SGD, lr=settings.rate),
         schedules=[LearningRateDecay(settings.passes)] if settings.falling else [],

@@ -6,7 +6,7 @@ scikit-learn. Densities are those of the user's columns, whatever the columns ar
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 from conditional_gaussian import MixedTable
-from fitting import AS_TYPED, Chosen, Settings, choose, coupled, read, trained
+from fitting import AS_TYPED, Chosen, Settings, choose, read, trained
 from marginals import agreement
 from medians import shown
 from mixture_of_classes import Classes, States, fit
@@ -41,11 +41,6 @@ SHIPPED = {"breast cancer": load_breast_cancer, "wine": load_wine}
 LOOKS = 6
 """How often a model is looked at in its training: it is taken where validation rows are likeliest."""
 OF_MIXED = [Settings(n_hidden=n, rate=rate, passes=90) for n in (8, 16, 50) for rate in (0.1, 0.2, 0.4)]
-COUPLED = [
-    # Sites that are coupled are drawn one after the other, so that updates take longer: fewer of them.
-    Settings(stage=coupled, n_hidden=6, rate=rate, passes=90, batch=100)
-    for rate in (0.1, 0.2, 0.4)
-]
 OF_SHIPPED = [Settings(n_hidden=n, rate=rate, passes=300) for n in (16, 64) for rate in (0.05, 0.1)]
 CLASSES = (2, 4, 6, 8, 12, 16, 24)
 COMPONENTS, COVARIANCES, LEAST = (1, 2, 3, 4, 6, 8, 10), ("full", "tied", "diag", "spherical"), (1e-6, 1e-3, 1e-2)
@@ -268,7 +263,6 @@ class Plan:
     n_samples: int = N_SAMPLES
     typed: Settings = AS_TYPED
     of_mixed: Sequence[Settings] = field(default_factory=lambda: OF_MIXED)
-    coupled: Sequence[Settings] = field(default_factory=lambda: COUPLED)
     shipped: Sequence[str] = field(default_factory=lambda: list(SHIPPED))
     of_shipped: Sequence[Settings] = field(default_factory=lambda: OF_SHIPPED)
     components: Sequence[int] = COMPONENTS
@@ -288,11 +282,10 @@ def made(plan: Plan) -> Iterator[dict[str, Any]]:
     for name, (method, settings) in fixed.items():
         models = [method(split, n_samples) for split in splits]
         yield {"table": "mixed", "model": name, **row_of(models, splits, base), "settings": settings}
-    for name, grid in {"RBM": plan.of_mixed, "RBM with visible couplings": plan.coupled}.items():
-        best = choose(tuning.table, grid, on_validation(tuning.table), seed=TUNING, looks=LOOKS)
-        models = [with_settings(best, split, n_samples) for split in splits]
-        settings = f"{best.settings}, {best.passes} passes"
-        yield {"table": "mixed", "model": name, **row_of(models, splits, base), "settings": settings}
+    best = choose(tuning.table, plan.of_mixed, on_validation(tuning.table), seed=TUNING, looks=LOOKS)
+    models = [with_settings(best, split, n_samples) for split in splits]
+    settings = f"{best.settings}, {best.passes} passes"
+    yield {"table": "mixed", "model": "RBM", **row_of(models, splits, base), "settings": settings}
     for name, method in {"the true density": truth, "training rows": training_rows}.items():
         models = [method(split, n_samples) for split in splits]
         yield {"table": "mixed", "model": name, **row_of(models, splits, base)}
@@ -326,7 +319,6 @@ def measure(*, quick: bool) -> Iterator[dict[str, Any]]:
             n_samples=200,
             typed=small,
             of_mixed=[small],
-            coupled=[replace(COUPLED[0], n_hidden=2, rate=0.4, passes=LOOKS)],
             shipped=["wine"],
             of_shipped=[small],
             components=(1, 2),
