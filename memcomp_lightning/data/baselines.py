@@ -16,6 +16,9 @@ MOST_IMAGES = 20_000
 MOST_NUMBERS = 2_400_000
 """Images, and inputs of all of them, that logistic regression is fitted to at most: about a second."""
 
+AT_ONCE = 10_000
+"""Images that are judged side by side: all of a large table would take gigabytes."""
+
 
 def n_fitted(v: Tensor) -> int:
     """Images that :func:`logistic_regression` is fitted to: the first ones, as many as take about a second."""
@@ -64,13 +67,22 @@ def independent_log_likelihood(
     units = Bernoulli(v.shape[-1]) if units is None else copy.deepcopy(units)
     alone = RBM(visible=units, n_hidden=1).double()
     start_at_means(alone, train_v.double(), train_observed)
+    total, n = 0.0, v.shape[-2]
+    for begin in range(0, n, AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        total += float(_log_p(alone, v[rows], None if observed is None else observed[rows]).sum())
+    return total / n
+
+
+def _log_p(alone: RBM, v: Tensor, observed: Tensor | None) -> Tensor:
+    """Of each image under the visible units by themselves."""
     v, bias = v.double(), alone.b.detach().unsqueeze(-2)
     log_p = alone.visible.site_sums(v * bias) - alone.visible.cumulant(bias)
     if observed is not None:
         v = torch.where(observed, v, 0.0)
         known = alone.visible.site_sums(observed.double()) > 0
         log_p = torch.where(known, log_p, 0.0)
-    return (log_p.sum(-1) - alone.visible.energy(v)).mean().item()
+    return log_p.sum(-1) - alone.visible.energy(v)
 
 
 def _fit_and_score(

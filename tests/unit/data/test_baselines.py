@@ -73,3 +73,13 @@ def test_a_unit_that_is_always_on_costs_little_and_never_infinity() -> None:
     ones = torch.ones(100, 1)
     assert -0.02 < independent_log_likelihood(ones, ones) < 0
     assert independent_log_likelihood(ones, torch.zeros(1, 1)) == pytest.approx(-4.6, abs=0.1)
+
+
+def test_images_are_judged_in_parts_that_count_by_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = rng.stream(0, "images")
+    train, v = (rng.bernoulli(torch.full((n, 4), 0.3), generator=generator) for n in (50, 7))
+    known = rng.bernoulli(torch.full((7, 4), 0.8), generator=generator).bool()
+    whole = [independent_log_likelihood(train, v, observed=mask) for mask in (None, known)]
+    monkeypatch.setattr(baselines, "AT_ONCE", 3)
+    parts = [independent_log_likelihood(train, v, observed=mask) for mask in (None, known)]
+    assert parts == pytest.approx(whole)
