@@ -15,7 +15,7 @@ from memcomp_lightning.data import Table, TableDataModule
 from memcomp_lightning.data.tables import TableData
 from memcomp_lightning.models import RBM, start_at_means
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.samplers import PCD
+from memcomp_lightning.samplers import PCD, NegativePhaseSampler
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.training import L1, DivergedError, Greedy, pretrain
 from memcomp_lightning.training.schedules import LearningRateDecay
@@ -32,6 +32,7 @@ class Settings:
         falling: Whether the rate falls.
         l1: Strength of the L1 penalty.
         batch: Rows an update.
+        sampler: Of the negative phase.
     """
 
     n_hidden: int
@@ -40,6 +41,7 @@ class Settings:
     falling: bool = True
     l1: float = 0.0
     batch: int = 20
+    sampler: Callable[[], NegativePhaseSampler] = PCD
 
     def __str__(self) -> str:
         penalty = f", L1 {self.l1:g}" if self.l1 else ""
@@ -98,7 +100,7 @@ def trained(table: TableData, settings: Settings, *, seed: int = 0, looks: int =
     for done in pretrain(
         Greedy(rbm),
         data.train_dataloader(),
-        PCD(),
+        settings.sampler(),
         iterations=settings.passes,
         optimizer=partial(SGD, lr=settings.rate),
         schedules=[LearningRateDecay(settings.passes)] if settings.falling else [],

@@ -6,7 +6,7 @@ scikit-learn. Densities are those of the user's columns, whatever the columns ar
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.data.tables import TableData
 from memcomp_lightning.data.tables.columns import Words
+from memcomp_lightning.samplers import ParallelTempering
 from memcomp_lightning.trained.partition import Annealing, LogZ
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.sampling import sample
@@ -42,6 +43,7 @@ LOOKS = 6
 """How often a model is looked at in its training: it is taken where validation rows are likeliest."""
 OF_MIXED = [Settings(n_hidden=n, rate=rate, passes=90) for n in (8, 16, 50) for rate in (0.1, 0.2, 0.4)]
 OF_SHIPPED = [Settings(n_hidden=n, rate=rate, passes=300) for n in (16, 64) for rate in (0.05, 0.1)]
+TEMPERED = "RBM, trained with parallel tempering"
 CLASSES = (2, 4, 6, 8, 12, 16, 24)
 COMPONENTS, COVARIANCES, LEAST = (1, 2, 3, 4, 6, 8, 10), ("full", "tied", "diag", "spherical"), (1e-6, 1e-3, 1e-2)
 
@@ -286,6 +288,9 @@ def made(plan: Plan) -> Iterator[dict[str, Any]]:
     models = [with_settings(best, split, n_samples) for split in splits]
     settings = f"{best.settings}, {best.passes} passes"
     yield {"table": "mixed", "model": "RBM", **row_of(models, splits, base), "settings": settings}
+    tempered = best._replace(settings=replace(best.settings, sampler=ParallelTempering))
+    models = [with_settings(tempered, split, n_samples) for split in splits]
+    yield {"table": "mixed", "model": TEMPERED, **row_of(models, splits, base), "settings": "the same"}
     for name, method in {"the true density": truth, "training rows": training_rows}.items():
         models = [method(split, n_samples) for split in splits]
         yield {"table": "mixed", "model": name, **row_of(models, splits, base)}

@@ -115,7 +115,7 @@ def test_rows_of_a_mixture_have_its_density(rows_of_classes):
 def test_all_models_are_measured():
     rows = {(row["table"], row["model"]): row for row in mixed.measure(quick=True)}
     assert [model for table, model in rows if table == "mixed"] == [
-        *("independent columns", "mixture of classes", "RBM at the defaults", "RBM"),
+        *("independent columns", "mixture of classes", "RBM at the defaults", "RBM", mixed.TEMPERED),
         *("the true density", "training rows"),
     ]
 
