@@ -48,7 +48,7 @@ class Settings:
         return f"{self.n_hidden} hidden, rate {self.rate:g}{penalty}"
 
 
-AS_TYPED = Settings(n_hidden=32, rate=defaults.LEARNING_RATE, passes=defaults.PASSES, falling=False)
+AS_TYPED = Settings(n_hidden=64, rate=defaults.LEARNING_RATE, passes=defaults.PASSES, falling=False)
 """What ``memcomp-train data=table data.path=...`` does without further settings."""
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 from scipy.stats import multivariate_normal
 
 from memcomp_lightning import rng
@@ -129,3 +130,14 @@ def test_all_models_are_measured():
         least, most = (number(table, model, "correlations") for model in ("independent columns", "training rows"))
         assert abs(least) < 0.2 < 0.7 < most
         assert rows[table, "RBM"]["log Z"] == "exact"
+
+
+def test_the_defaults_are_those_of_the_command():
+    with initialize_config_module("memcomp_lightning.conf", version_base=None):
+        settings = compose("config", ["data=table"])
+    typed = mixed.AS_TYPED
+    assert list(settings.model.hidden_sizes) == [typed.n_hidden]
+    assert (settings.pretrain.iterations, settings.pretrain.batch_size) == (typed.passes, typed.batch)
+    assert settings.pretrain.optimizer.lr == typed.rate
+    assert settings.sampler._target_.endswith(".PCD")
+    assert settings.pretrain.schedules.decay is None
