@@ -44,6 +44,7 @@ def logistic_regression(train: tuple[Tensor, Tensor], test: tuple[Tensor, Tensor
         return _fit_and_score(*arrays)
 
 
+@torch.no_grad()
 def independent_log_likelihood(
     train_v: Tensor,
     v: Tensor,

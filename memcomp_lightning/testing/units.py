@@ -418,7 +418,7 @@ def _check_data(name: str, units: Units, field: Tensor) -> None:
         try:
             units.check(spoiled, pure=pure, column=7)
         except SettingError as error:
-            at = f"column {7 + int(entries[0])}"
+            at = f"column {7 + units.n_sites - 1},"
             _check(at in str(error), f"{name}: check does not name {at} of a value that is nan: {error}")
         else:
             _check(False, f"{name}: check takes nan")
