@@ -73,9 +73,13 @@ def test_every_experiment_runs_fast(memcomp_train: Run, experiment: str) -> None
     assert outcome.status == 0, outcome.err
 
 
-@pytest.mark.parametrize("logger", options("logger"))
-@pytest.mark.parametrize("callbacks", options("callbacks"))
-def test_every_logger_and_set_of_callbacks(memcomp_train: Run, logger: str, callbacks: str) -> None:
+BESIDE = [(callbacks, "both") for callbacks in options("callbacks")]
+BESIDE += [("default", "none"), ("diagnostics", "csv"), ("diagnostics_exact", "tensorboard")]
+"""Each set of callbacks and each logger, those of diagnostics without a board, too."""
+
+
+@pytest.mark.parametrize(("callbacks", "logger"), BESIDE)
+def test_every_logger_and_set_of_callbacks(memcomp_train: Run, callbacks: str, logger: str) -> None:
     # Small enough to enumerate, which diagnostics_exact does.
     settings = ["sampler=cd", "model.hidden_sizes=[7]", *FAST, "hydra.run.dir=run"]
     outcome = memcomp_train(*settings, f"logger={logger}", f"callbacks={callbacks}")

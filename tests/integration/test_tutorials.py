@@ -24,6 +24,8 @@ def test_a_tutorial_runs(page: Path, run_command: Callable[..., Outcome], tmp_pa
             command, *arguments = shlex.split(line, comments=True)
             main = import_module(f"memcomp_lightning.cli.{command.removeprefix('memcomp-')}").main
             quick = ["callbacks=minimal", "logger=none"] if command == "memcomp-train" else []
+            if any(argument.startswith("finetune.iterations=") for argument in arguments):
+                quick.append("finetune.iterations=10")
             found = run_command(command, main, (*arguments, *quick))
             assert found.status == 0, f"{line}\n{found.err}"
 

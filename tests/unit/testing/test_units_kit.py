@@ -47,7 +47,7 @@ class Three(Units):
         right = (v.abs() <= 1) & (~torch.tensor(pure) | (v == v.round()))
         wrong = (~right if observed is None else ~right & observed).nonzero().tolist()
         if wrong:
-            raise SettingError(f"column {column + wrong[0][-1]}")
+            raise SettingError(f"v in column {column + wrong[0][-1]}, row {wrong[0][0]}")
 
     def bias_of(self, total, n):
         mean = (total / n).clamp(-0.999999, 0.999999)
