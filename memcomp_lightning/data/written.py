@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
@@ -27,22 +28,40 @@ SEQUENCE = "sequence"
 _NO_ARROW = "Parquet needs Arrow, which is not installed: pip install pyarrow."
 
 
-def check_output(path: Path, *, overwrite: bool, endings: Sequence[str] = ENDINGS) -> None:
+def check_output(
+    path: Path, *, overwrite: bool, endings: Sequence[str] = ENDINGS, setting: str = "output"
+) -> None:
     """Refuse, before anything is computed, a file that cannot be written or is there already.
+
+    Args:
+        path: The file.
+        overwrite: Whether it may be there.
+        endings: That it may have.
+        setting: The name of the setting, for the error.
 
     Raises:
         UserError: It says what to type.
     """
     if not path.name.lower().endswith(tuple(endings)):
-        raise UserError(f"output={path}: expected a file that ends in {', '.join(endings)}.")
+        raise UserError(f"{setting}={path}: expected a file that ends in {', '.join(endings)}.")
     if path.is_dir() or not path.parent.is_dir():
-        raise UserError(f"output={path}: {'this is a folder' if path.is_dir() else 'there is no such folder'}.")
+        raise UserError(f"{setting}={path}: {'this is a folder' if path.is_dir() else 'there is no such folder'}.")
     if path.exists() and not overwrite:
-        raise UserError(f"output={path}: the file is there already. Choose another, or type overwrite=true.")
+        raise UserError(f"{setting}={path}: the file is there already. Choose another, or type overwrite=true.")
     if not os.access(path.parent, os.W_OK):
-        raise UserError(f"output={path}: you may not write in its folder. Choose another.")
+        raise UserError(f"{setting}={path}: you may not write in its folder. Choose another.")
     if path.suffix.lower() == ".parquet" and find_spec("pyarrow") is None:
-        raise UserError(f"output={path}: {_NO_ARROW}")
+        raise UserError(f"{setting}={path}: {_NO_ARROW}")
+
+
+def check_kind(path: Path, schema: Schema) -> None:
+    """Refuse, before anything is computed, a file of sequences for other rows.
+
+    Raises:
+        UserError: It says which endings there are.
+    """
+    if path.name.lower().endswith(".fasta") and SEQUENCE not in schema.decode(torch.zeros(1, schema.n_sites)):
+        raise UserError(f"output={path}: these rows are no sequences. Choose .csv, .parquet or .npz.")
 
 
 def in_one_array(columns: Columns, schema: Schema, path: Path) -> Columns:

@@ -294,6 +294,17 @@ WRONG: dict[str, tuple[list[str], Callable[[], object] | None, str]] = {
 }
 OF_IMPUTE: dict[str, tuple[list[str], Callable[[], object] | None, str]] = {
     "no draws": (["run", "gaps.csv", "m=0"], None, "m = 0 is not allowed: expected an integer >= 1."),
+    "too many draws": (["run", "gaps.csv", "m=1001"], None, "m = 1001 is not allowed: expected at most 1,000"),
+    "sequences of a table": (
+        ["run", "gaps.csv", "output=a.fasta"],
+        None,
+        "output=a.fasta: these rows are no sequences. Choose .csv, .parquet or .npz.",
+    ),
+    "probabilities that are there": (
+        ["run", "gaps.csv", "output=a.csv", "probabilities=gaps.csv"],
+        None,
+        "probabilities=gaps.csv: the file is there already. Choose another, or type overwrite=true.",
+    ),
     "both in one file": (
         ["run", "gaps.csv", "output=a.csv", "probabilities=a.csv"],
         None,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
-from memcomp_lightning.data.written import ENDINGS, TABLES, check_output, in_one_array, write_columns
-from memcomp_lightning.errors import UserError, require_count
+from memcomp_lightning.data.written import ENDINGS, TABLES, check_kind, check_output, in_one_array, write_columns
+from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
@@ -16,6 +16,9 @@ from memcomp_lightning.trained.masking import figure_of_imputation, masked
 
 HIDDEN = 0.1
 """Share of the known cells that is hidden for figures."""
+
+MOST_FILES = 1_000
+"""Draws, each of which is a file."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +70,19 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Complete a file."""
     if settings.m is not None:
         require_count("m", settings.m)
+        require(settings.m <= MOST_FILES, "m", settings.m, f"at most {MOST_FILES:,}: each draw is a file")
     outputs = _outputs(Path(settings.output), settings.m)
     gaps = None if settings.probabilities is None else Path(settings.probabilities)
     for path in outputs:
         check_output(path, overwrite=settings.overwrite)
     if gaps is not None:
-        check_output(gaps, overwrite=settings.overwrite, endings=TABLES)
+        check_output(gaps, overwrite=settings.overwrite, endings=TABLES, setting="probabilities")
     if gaps in outputs:
         raise UserError(f"probabilities={gaps}: the completed table goes there. Choose another file.")
     if settings.figures is not None:
         check_figures(Path(settings.figures), overwrite=settings.overwrite)
     run, table = load(places[0], replica=settings.replica, schema=settings.schema), existing(places[1])
+    check_kind(outputs[0], run.needed_schema)
     chains = MissingChains(n_chains=settings.chains, most_sweeps=settings.sweeps)
     rows = run.needed_schema.read(table, complete=False)
     found = impute(run, rows, m=settings.m, seed=settings.seed, chains=chains)

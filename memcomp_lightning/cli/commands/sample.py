@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
-from memcomp_lightning.data.written import SEQUENCE, check_output, in_one_array, write_columns
+from memcomp_lightning.data.written import check_kind, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.trained import load
@@ -91,7 +90,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     check_output(output, overwrite=settings.overwrite)
     run = load(places[0], replica=settings.replica, schema=settings.schema)
     schema = run.needed_schema
-    _check_kind(output, schema)
+    check_kind(output, schema)
     figure = None if settings.figure is None else _checked_figure(settings, schema)
     beside = _beside(settings, schema)
     given = _given(settings, schema)
@@ -159,12 +158,6 @@ def _beside(settings: Settings, schema: Schema) -> Rows | None:
 
     check_figures(Path(settings.figures), overwrite=settings.overwrite)
     return schema.read(existing(settings.data), complete=False)
-
-
-def _check_kind(output: Path, schema: Schema) -> None:
-    """Refuse a file of sequences for other rows, before they are drawn."""
-    if output.name.lower().endswith(".fasta") and SEQUENCE not in schema.decode(torch.zeros(1, schema.n_sites)):
-        raise UserError(f"output={output}: these rows are no sequences. Choose .csv, .parquet or .npz.")
 
 
 def _checked_figure(settings: Settings, schema: Schema) -> Path:
