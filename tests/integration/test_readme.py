@@ -35,3 +35,12 @@ def test_links_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\(([^)]+)\)", page.read_text())
     paths = [link.split("#")[0] for link in links if "://" not in link]
     assert [path for path in paths if path and not (page.parent / path).exists()] == []
+
+
+def test_the_site_begins_with_the_same_tasks() -> None:
+    def tasks(page: Path) -> list[str]:
+        return re.findall(r"^\| .*\|$", page.read_text(), flags=re.MULTILINE)[:9]
+
+    of_site = [line.replace("](../experiments/", "](experiments/") for line in tasks(ROOT / "docs/index.md")]
+    assert len(of_site) == 9
+    assert of_site == [line.replace("](docs/", "](") for line in tasks(ROOT / "README.md")]
