@@ -157,7 +157,8 @@ class LogLikelihood(EveryIterations):
         train, observed = self._train.images(), self._train.observed()
         if not sums_missing(model, observed):
             self.leave_out(
-                "missing values are summed for models of up to 16 hidden units, coupled to visible ones"
+                "missing values are summed for models of up to 16 hidden units, coupled to visible ones; "
+                "memcomp-score gives likelihoods of others"
             )
             return
         values = self._partition_function(model, method, train, observed)

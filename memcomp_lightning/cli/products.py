@@ -115,7 +115,7 @@ def existing(path: str) -> Path:
         UserError: There is none.
     """
     if not Path(path).is_file():
-        raise UserError(f"{path}: there is no such file.")
+        raise UserError(f"{path}: {'this is a folder' if Path(path).is_dir() else 'there is no such file'}.")
     return Path(path)
 
 

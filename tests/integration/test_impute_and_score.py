@@ -242,6 +242,13 @@ def test_a_column_with_the_name_of_a_score_is_left_out_and_that_is_said(memcomp_
     assert set(found["class"]) == {"cat", "dog"}
 
 
+def test_a_misspelt_column_is_said(memcomp_score: Command, run: str) -> None:
+    people().rename(columns={"age": "Age"}).to_csv("other.csv", index=False)
+    outcome = memcomp_score(run, "other.csv")
+    assert outcome.status == 0, outcome.err
+    assert "columns without any value, or not in the file: age\n" in outcome.out
+
+
 def change(name: str, row: int, value: str) -> None:
     table = read("gaps.csv")
     table.loc[row, name] = value

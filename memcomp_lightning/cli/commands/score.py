@@ -8,6 +8,8 @@ import numpy as np
 
 from memcomp_lightning.cli.output import say
 from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.data.rows import Rows
+from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.plotting.written import check_figures, write_figures
@@ -81,13 +83,22 @@ def act(places: Sequence[str], settings: Settings) -> None:
     write_columns(columns, output, overwrite=settings.overwrite)
     if settings.figures is not None:
         write_figures(figures, Path(settings.figures), overwrite=settings.overwrite)
-    say("\n".join([_summary(found, settings), *doubts, *left_out(hidden)]))
+    say("\n".join([_summary(found, settings), *_empty(rows, run.needed_schema), *doubts, *left_out(hidden)]))
     say(f"written: {output}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     carry_out(USAGE, act, arguments)
+
+
+def _empty(rows: Rows, schema: Schema) -> list[str]:
+    """A line on columns of the model that no row has a value of; none without any."""
+    if rows.observed is None:
+        return []
+    known = rows.observed.any(0).tolist()
+    names = [name for name, has_some in zip(schema.site_names, known, strict=True) if not has_some]
+    return [f"columns without any value, or not in the file: {', '.join(names)}"] if names else []
 
 
 def _summary(found: Scores, settings: Settings) -> str:

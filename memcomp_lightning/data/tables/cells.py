@@ -10,6 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+TRUTH = ("false", "true")
+"""Words that are one in any case."""
+
 EMPTY = ("", "NA", "N/A", "NaN", "nan", "null", "NULL", "None", "?")
 """Texts that stand for a missing value."""
 
@@ -49,6 +52,9 @@ class Cells:
             array = pc.cast(array, pa.string())
         if _is_text(array.type):
             array = pc.utf8_trim_whitespace(pc.cast(array, pa.string()))
+            lower = pc.utf8_lower(array)
+            # Truth values, as programs spell them: False, FALSE and false are one word.
+            array = pc.if_else(pc.is_in(lower, value_set=pa.array(TRUTH)), lower, array)
             empty = pc.is_in(array, value_set=pa.array(EMPTY))
             return pc.if_else(pc.fill_null(empty, True), pa.scalar(None, pa.string()), array)
         numbers = pc.cast(array, pa.float64(), safe=False)
@@ -97,7 +103,8 @@ class Cells:
     def index_of(self, words: Sequence[Any]) -> NDArray[np.float32]:
         """Number of each cell's word; NaN where it is empty or none of them."""
         if isinstance(words[0], str):
-            plain, known = pc.cast(self.plain, pa.string()), pa.array(list(words), pa.string())
+            folded = [word.lower() if word.lower() in TRUTH else word for word in words]
+            plain, known = pc.cast(self.plain, pa.string()), pa.array(folded, pa.string())
         else:
             plain = self.plain
             if self.are_texts:

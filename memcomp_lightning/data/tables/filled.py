@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from memcomp_lightning.data.schema import Columns
-from memcomp_lightning.data.tables.cells import Cells
+from memcomp_lightning.data.tables.cells import TRUTH, Cells
 from memcomp_lightning.data.tables.readers import opened
 from memcomp_lightning.data.tables.schema import TableSchema
 from memcomp_lightning.errors import UserError
@@ -82,9 +82,16 @@ def _with(column: NDArray[Any], empty: NDArray[np.bool_], values: NDArray[Any]) 
     if isinstance(known, bool):  # whose words are texts to the model
         cells = [cell == "true" for cell in cells]
     elif isinstance(known, str):
-        cells = [_text(cell) for cell in cells]
+        cells = [_like(known, _text(cell)) for cell in cells]
     column[empty] = cells
     return column
+
+
+def _like(known: str, text: str) -> str:
+    """A truth value in the case of the others."""
+    if text not in TRUTH or known.strip().lower() not in TRUTH:
+        return text
+    return text.upper() if known.isupper() else text.capitalize() if known.strip()[0].isupper() else text
 
 
 def _text(value: Any) -> str:

@@ -18,6 +18,9 @@ MOST_WORDS = 100
 MOST_WHOLE = 10
 """Different whole numbers of a column that is taken for a category."""
 
+FEW_ROWS = 20
+"""From so many rows on, whole numbers that rise from row to row are a key."""
+
 _KEPT = 1000
 """Different cells that are remembered; a category may not have more."""
 
@@ -38,6 +41,7 @@ class Summary:
         varies: Whether the numbers in training rows differ.
         uneven: The first number that is not whole, as it stands, and its row from 1; None where there is none.
         counts: Whether the numbers go up by one from row to row.
+        rises: Whether they are whole and go up from row to row, by any step.
     """
 
     name: str
@@ -52,8 +56,10 @@ class Summary:
     varies: bool = False
     uneven: tuple[int, str] | None = None
     counts: bool = True
+    rises: bool = True
     _first: float = math.nan
     _some: float = math.nan
+    _last: float = -math.inf
 
     def add(self, cells: Cells, trained: NDArray[np.bool_] | None = None) -> None:
         """Take in some more rows.
@@ -91,6 +97,9 @@ class Summary:
             self._first = float(numbers[0]) - self.n
         in_turn = numbers == self._first + self.n + np.arange(len(numbers))
         self.counts = self.counts and self._first.is_integer() and bool(in_turn.all())
+        steps = np.diff(numbers, prepend=self._last)
+        self.rises = self.rises and bool((steps > 0).all()) and bool((numbers == np.round(numbers)).all())
+        self._last = float(numbers[-1])
         x = numbers[known]
         if not len(x):
             return
@@ -205,6 +214,8 @@ def _left_out(summary: Summary) -> str | None:
     """Why a column is none for the model."""
     if summary.odd is None and summary.counts and summary.n > 2:
         return "it counts the rows"
+    if summary.odd is None and summary.rises and summary.n >= FEW_ROWS:
+        return "its whole numbers rise from row to row, as those of a key do"
     if summary.odd is not None and not _is_mixed(summary):
         if summary.distinct is None:
             return f"more than {_KEPT} different texts"

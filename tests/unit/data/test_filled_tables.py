@@ -15,6 +15,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import PixelLayout, Table, TableDataModule
 from memcomp_lightning.data.schema import ImageSchema
 from memcomp_lightning.data.tables import TableSchema
+from memcomp_lightning.data.tables.cells import Cells
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.data.tables.filled import filled
 from memcomp_lightning.data.written import in_one_array, write_columns
@@ -104,6 +105,27 @@ def test_a_part_without_rows_is_no_end(tmp_path: Path) -> None:
         [pa.RecordBatch.from_pylist([], schema=table.schema), *table.to_batches()], schema=table.schema
     )
     assert TableDataModule.from_frame(parts).n_train > 0
+
+
+def test_truth_values_are_one_word_in_any_case(tmp_path: Path) -> None:
+    """As pandas writes them, as Arrow does, and as booleans; what is filled in is spelt as the others."""
+    for spelt in ("True", "TRUE", "true"):
+        (tmp_path / "b.csv").write_text(f"on,age\n{spelt},20\n,21\n{spelt},22\n")
+        found = filled(tmp_path / "b.csv", SCHEMA, V)
+        assert found["on"].tolist() == [spelt, {"True": "False", "TRUE": "FALSE", "true": "false"}[spelt], spelt]
+        assert SCHEMA.read(tmp_path / "b.csv", complete=False).v[[0, 2], 0].tolist() == [1.0, 1.0]
+    capital = Binary("on", ("False", "True"))
+    assert capital.read(Cells(pa.array([True, False]))).tolist() == [1.0, 0.0]
+
+
+def test_a_key_with_holes_is_left_out() -> None:
+    """Rows of a larger table: their numbers rise, and say nothing; numbers that do not rise do."""
+    n = 40
+    key = np.cumsum(rng.numpy_stream(0, "steps").integers(1, 9, n))
+    columns = {"key": key, "other": key[::-1].copy(), "x": np.sin(key)}
+    data = TableDataModule.from_frame(pa.table(columns))
+    assert data.schema.site_names == ["other", "x"]
+    assert "its whole numbers rise from row to row" in data.described
 
 
 def test_what_is_beside_a_table_is_read_alone(tmp_path: Path) -> None:
