@@ -8,7 +8,7 @@ import pytest
 
 from memcomp_lightning.data.tables import Table
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "tables"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "tables"))
 import alignments
 import commands
 import scale

@@ -9,7 +9,7 @@ import pytest
 
 from memcomp_lightning import rng
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "experiments" / "tables"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments" / "tables"))
 import genotypes
 from haplotypes import Panel
 from medians import shown
