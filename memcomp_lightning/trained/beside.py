@@ -1,5 +1,6 @@
 """What else a file says of its rows, beside what a model reads: names, numbers, classes."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from memcomp_lightning.data.rows import Rows
@@ -42,3 +43,8 @@ def left_out(hidden: list[str]) -> list[str]:
     """A line on columns that are left out; none without any."""
     names = ", ".join(map(repr, hidden))
     return [f"left out of the table's columns, as what was found has this name: {names}"] if hidden else []
+
+
+def without_values(names: Sequence[str]) -> list[str]:
+    """A line on columns of the model that no row has a value of; none without any."""
+    return [f"columns without any value, or not in the file: {', '.join(names)}"] if names else []

@@ -266,10 +266,7 @@ def _forget_lost_initialisers(model: DictConfig) -> None:
 
 def _is_lost(target: str) -> bool:
     """Whether a name of this package is that of nothing in this version."""
-    try:
-        return target.startswith("memcomp_lightning.") and resolve_name(target) is None
-    except (ImportError, AttributeError, ValueError):
-        return True
+    return target.startswith("memcomp_lightning.") and _named(target) is None
 
 
 def _is_part(target: str) -> bool:

@@ -11,6 +11,7 @@ from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
+from memcomp_lightning.trained.beside import without_values
 from memcomp_lightning.trained.imputation import Imputation, completed_columns, gap_columns, impute
 from memcomp_lightning.trained.masking import figure_of_imputation, masked
 
@@ -120,9 +121,7 @@ def _summary(found: Imputation, chains: MissingChains, site_names: Sequence[str]
     lines = [f"{found.n_gaps:,} gaps in {n_rows:,} of {found.rows.n:,} rows filled"]
     if found.mean_probability == found.mean_probability:
         lines[0] += f"; discrete values are right with a mean probability of {found.mean_probability:.3f}"
-    empty = [site_names[gaps.site] for gaps in found.gaps if len(gaps.row) == found.rows.n]
-    if empty:
-        lines.append(f"columns without any value, or not in the file: {', '.join(empty)}")
+    lines += without_values([site_names[gaps.site] for gaps in found.gaps if len(gaps.row) == found.rows.n])
     r_hat = found.r_hat[~found.r_hat.isnan()]
     if not len(r_hat):
         return "\n".join([*lines, "by exact sums" if found.n_gaps else "nothing was missing"])

@@ -14,7 +14,7 @@ from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.plotting.written import check_figures, write_figures
 from memcomp_lightning.trained import load
-from memcomp_lightning.trained.beside import beside, left_out
+from memcomp_lightning.trained.beside import beside, left_out, without_values
 from memcomp_lightning.trained.figures import figure_of_scores
 from memcomp_lightning.trained.partition import Annealing
 from memcomp_lightning.trained.scoring import Scores, score
@@ -83,7 +83,8 @@ def act(places: Sequence[str], settings: Settings) -> None:
     write_columns(columns, output, overwrite=settings.overwrite)
     if settings.figures is not None:
         write_figures(figures, Path(settings.figures), overwrite=settings.overwrite)
-    say("\n".join([_summary(found, settings), *_empty(rows, run.needed_schema), *doubts, *left_out(hidden)]))
+    empty = without_values(_empty(rows, run.needed_schema))
+    say("\n".join([_summary(found, settings), *empty, *doubts, *left_out(hidden)]))
     say(f"written: {output}")
 
 
@@ -93,12 +94,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _empty(rows: Rows, schema: Schema) -> list[str]:
-    """A line on columns of the model that no row has a value of; none without any."""
+    """Columns of the model that no row has a value of."""
     if rows.observed is None:
         return []
     known = rows.observed.any(0).tolist()
-    names = [name for name, has_some in zip(schema.site_names, known, strict=True) if not has_some]
-    return [f"columns without any value, or not in the file: {', '.join(names)}"] if names else []
+    return [name for name, has_some in zip(schema.site_names, known, strict=True) if not has_some]
 
 
 def _summary(found: Scores, settings: Settings) -> str:

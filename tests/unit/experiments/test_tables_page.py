@@ -17,4 +17,4 @@ def test_the_page_has_each_table_as_it_was_measured(path):
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert path.stem in run.PARTS
-    assert run.markdown(rows) in (FOLDER / "README.md").read_text()
+    assert run.parts.markdown(rows) in (FOLDER / "README.md").read_text()
