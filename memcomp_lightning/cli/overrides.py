@@ -22,7 +22,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.cli.arguments import CommandLine, parse, with_path
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
-from memcomp_lightning.configuration.composition import CONFIG_MODULE, SEARCH_PATH, composing, search_paths
+from memcomp_lightning.configuration.composition import (
+    CONFIG_MODULE,
+    SEARCH_PATH,
+    STUDIES,
+    composing,
+    search_paths,
+)
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_exists, explain
 from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.errors import UserError
@@ -192,7 +198,7 @@ def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[s
             raise UserError(f"{typed} is not possible: {name} is needed. {instead}")
         if name in groups and adds and name in plain().hydra.runtime.choices:
             raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
-        if name in ("figure", "worth") and not adds:
+        if name in STUDIES and not adds:
             experiments = ", ".join(loader.get_group_options("experiment"))
             remedy = f"Write experiment=NAME. Known here: {experiments}."
             raise UserError(f"{typed} is not possible: an experiment sets it. {remedy}")

@@ -10,6 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from omegaconf import DictConfig, OmegaConf
 
+from memcomp_lightning.configuration.composition import study_of
 from memcomp_lightning.configuration.values import require_held_out
 from memcomp_lightning.errors import UserError, require
 
@@ -50,7 +51,7 @@ def named_by_time(settings: DictConfig) -> str | None:
 
 def check_searchable(config: DictConfig) -> None:
     """Refuse a job that returns nothing to search by."""
-    is_one = config.figure is None and config.worth is None
+    is_one = study_of(config) is None
     require(is_one, "experiment", "one of many runs", "one run in a search")
     require_held_out(config, "in a search", "settings")
     n_passes = config.finetune.iterations

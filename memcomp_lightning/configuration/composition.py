@@ -17,13 +17,21 @@ CONFIG_MODULE = "memcomp_lightning.conf"
 SEARCH_PATH = "hydra.searchpath="
 """Begins the override that says where else groups are looked for."""
 
-_OF_MANY_RUNS = ("hydra.", "figure.", "figure/", "worth.", "worth/")
+STUDIES = ("figure", "worth", "density")
+"""Settings that an experiment of many runs fills, each with a study of its own; null in a single run."""
+
+_OF_MANY_RUNS = ("hydra.", *(f"{name}{mark}" for name in STUDIES for mark in "./"))
 """Overrides that say nothing of a single run."""
 
 
 def composing() -> AbstractContextManager[None]:
     """The context in which :func:`composed_for` and Hydra's ``compose`` find our groups, outside of a command."""
     return initialize_config_module(CONFIG_MODULE, **INITIALIZE)
+
+
+def study_of(config: DictConfig) -> str | None:
+    """The setting of many runs that an experiment has filled; None in a single run."""
+    return next((name for name in STUDIES if config.get(name) is not None), None)
 
 
 def search_paths(overrides: Iterable[str]) -> list[str]:
@@ -51,7 +59,8 @@ def _composed(search_path: tuple[str, ...], common: tuple[str, ...], own: tuple[
         bare = compose("config", [*search_path, *groups])
         applying = (o for o in common if _applies(o.partition("=")[0], bare))
         composed = compose("config", [*search_path, *applying, *own])
-    composed.figure = composed.worth = None
+    for study in STUDIES:
+        composed[study] = None
     return composed
 
 

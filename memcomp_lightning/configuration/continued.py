@@ -8,6 +8,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from memcomp_lightning.configuration.composition import study_of
 from memcomp_lightning.data.schema import Schema, schema_of
 from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.modules.weights import load_weights, read_checkpoint
@@ -101,7 +102,7 @@ def finished(path: Path) -> RunFolder:
     if folder.overrides is None or not (path / "settings.yaml").is_file():
         raise UserError(f"continue={path}: there is no overrides.json. Name the folder of a run of memcomp-train.")
     config = cast(DictConfig, OmegaConf.load(path / "settings.yaml"))
-    if config.get("figure") is not None or config.get("worth") is not None:
+    if study_of(config) is not None:
         raise UserError(
             f"continue={path}: this is a figure or a comparison of many runs. Name the folder of one run."
         )

@@ -20,6 +20,7 @@ from torch import nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar, StillFalling
+from memcomp_lightning.configuration.composition import STUDIES
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
@@ -50,7 +51,7 @@ _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed"
 _DEALT = ("partitions", "first_partitions", "validation_fraction", "chunk_size")
 _STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
-    "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", "figure", "worth"),
+    "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", *STUDIES),
     "data": ("source", *_DEALT),
     "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "penalties", "stage"),
     "finetune": (*_STAGE_SETTINGS, "loss", "units", "labels", "class_weights", "dropout", *_STOPPING),

@@ -167,7 +167,7 @@ def _is(value: Any, kind: Any) -> bool:
 def _is_part(kind: Any) -> bool:
     """Whether it is a class, a callable or a mapping: nothing that one value could stand for."""
     origin = typing.get_origin(kind) or kind
-    if not inspect.isclass(origin) or origin in (object, *_WORDS):
+    if not inspect.isclass(origin) or origin in (object, Any, *_WORDS):
         return False
     return not (issubclass(origin, PathLike) or _is_list(kind))
 

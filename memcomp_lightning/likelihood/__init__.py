@@ -2,6 +2,7 @@
 
 from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, base_of
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class, log_likelihood_bound
+from memcomp_lightning.likelihood.both_ways import BothWays, estimate_both_ways
 from memcomp_lightning.likelihood.exact import (
     exact_samples,
     kl_divergence,
@@ -14,9 +15,11 @@ from memcomp_lightning.likelihood.pseudo import log_pseudo_likelihood
 __all__ = [
     "Ais",
     "AisEstimate",
+    "BothWays",
     "ReverseAis",
     "base_of",
     "base_on_first_class",
+    "estimate_both_ways",
     "exact_samples",
     "kl_divergence",
     "log_likelihood",

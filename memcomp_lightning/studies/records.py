@@ -12,7 +12,7 @@ from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
 
 Measures = dict[str, list[list[float]]]
-Key = tuple[str, str, float | None, int | None, int | None, bool]
+Key = tuple[str, str, float | None, str, int | None, int | None, bool]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +23,7 @@ class Named:
         method: What was trained: a curve of a figure, a method of a comparison.
         data_set: Name of the data set; "" in a study of one.
         value: Of the setting that held-out data choose; None if nothing is chosen.
+        setting: All of them where they choose several, as JSON.
         iterations: Pretraining iterations N of each layer; None where the method says how many.
         seed: Of weights, chains and order; None where each replica has its own.
         choosing: Whether the trial only serves the choice: held-out data then judge it.
@@ -31,6 +32,7 @@ class Named:
     method: str
     data_set: str = ""
     value: float | None = None
+    setting: str = ""
     iterations: int | None = None
     seed: int | None = None
     choosing: bool = False
@@ -38,7 +40,7 @@ class Named:
     @property
     def key(self) -> Key:
         """All of it."""
-        return self.data_set, self.method, self.value, self.iterations, self.seed, self.choosing
+        return self.data_set, self.method, self.value, self.setting, self.iterations, self.seed, self.choosing
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,9 @@ from matplotlib.figure import Figure
 
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, write_text, written_whole
+from memcomp_lightning.studies.density import read_densities
+from memcomp_lightning.studies.density.plot import density_figures
+from memcomp_lightning.studies.density.results import DENSITY_RULE, density_table, density_verdicts
 from memcomp_lightning.studies.page import Section, markdown
 from memcomp_lightning.studies.plot_accuracy import accuracy_figures
 from memcomp_lightning.studies.plot_worth import plot_worth
@@ -40,6 +43,12 @@ def write_report(folder: Path) -> Section:
         figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
         numbers, judged = as_csv(worth_table(worth)), worth_verdicts(worth)
         write_events(worth, folder / "tensorboard")
+    elif (folder / "density.json").exists():
+        densities = read_densities(folder)
+        _check_measured(folder, bool(densities.tables))
+        name, title, rule = densities.plan.name, densities.plan.title, DENSITY_RULE
+        figures, numbers = density_figures(densities), as_csv(density_table(densities))
+        judged = density_verdicts(densities)
     else:
         results = read_results(folder)
         _check_measured(folder, bool(results.curves))

@@ -24,9 +24,9 @@ from memcomp_lightning.cli.continued import with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
 from memcomp_lightning.cli.search import check_searchable
-from memcomp_lightning.configuration import comparisons, figures, trajectory
+from memcomp_lightning.configuration import comparisons, densities, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
-from memcomp_lightning.configuration.composition import CONFIG_MODULE
+from memcomp_lightning.configuration.composition import CONFIG_MODULE, study_of
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
@@ -41,6 +41,9 @@ from memcomp_lightning.runs.table import closing_lines, run_table, short_path
 from memcomp_lightning.training import DivergedError
 
 COMMAND = "memcomp-train"
+
+_ALONE = {"worth": comparisons, "density": densities}
+"""What checks and trains a study that is no figure, by its setting."""
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +77,7 @@ def train(config: DictConfig) -> float | None:
 
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
-    if config.figure is not None or config.worth is not None:
+    if study_of(config) is not None:
         allowed = "null: figures and comparisons train new networks"
         require(config["continue"] is None, "continue", config["continue"], allowed)
         for study, part, own in _studies(config, overrides).values():
@@ -100,8 +103,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
 
 def _studies(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[ModuleType, DictConfig, list[str]]]:
     """What checks and trains a comparison, or each figure of a run, with its settings, by the folder of each."""
-    if config.worth is not None:
-        return {".": (comparisons, config, list(overrides))}
+    if (alone := _ALONE.get(study_of(config) or "")) is not None:
+        return {".": (alone, config, list(overrides))}
     if not {"name", "all"} & set(config.figure):
         raise UserError("preset=quick makes a figure smaller: name one, as in experiment=figure4 preset=quick.")
     parts = figures.parts(config, overrides).items()
@@ -109,7 +112,7 @@ def _studies(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[Mo
 
 
 def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float | None:
-    if config.figure is not None or config.worth is not None:
+    if study_of(config) is not None:
         _many(config, folder, overrides)
         return None
     if _is_first_process():

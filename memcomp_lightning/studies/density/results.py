@@ -1,0 +1,224 @@
+"""What a comparison of density models found: of each model and peer the setting that held-out rows chose."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from memcomp_lightning.studies.density.peers import Peer
+from memcomp_lightning.studies.density.search import Setting
+from memcomp_lightning.studies.density.settings import Density, Model
+from memcomp_lightning.studies.records import Record, Records
+from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
+from memcomp_lightning.studies.worth import holm
+
+WITHIN = 1.0
+"""Nats by which AIS and reverse AIS may differ in a number that is given."""
+
+
+class Found(NamedTuple):
+    """What is reported of a model or a peer on a table; nats a row.
+
+    Attributes:
+        setting: That held-out rows chose.
+        test: Log-likelihood of test rows, a number a seed: the lower of both estimates.
+        gap: By how much AIS is above reverse AIS, the largest of all seeds.
+        standard_error: Of log Z, the largest of all seeds.
+        valid: Of held-out rows, by which the pass was chosen, too.
+        train: Of training rows after that pass, by the quick estimate; NaN of peers.
+        independent: Of test rows by independent bits; NaN of peers.
+        seconds: Of the processor, a seed; of training alone.
+        tried: Settings.
+    """
+
+    setting: Setting
+    test: NDArray[np.float64]
+    gap: float
+    standard_error: float
+    valid: float
+    train: float
+    independent: float
+    seconds: float
+    tried: int
+
+    @property
+    def known(self) -> bool:
+        """Whether the likelihood is known well enough to be given as a number."""
+        return bool(abs(self.gap) <= WITHIN) and bool(np.isfinite(self.test).all())
+
+    @property
+    def mean(self) -> float:
+        """Over seeds."""
+        return float(self.test.mean())
+
+    @property
+    def half_width(self) -> float:
+        """Of the 95 % interval of the mean over seeds (t distribution); NaN of one seed."""
+        n = len(self.test)
+        if n < 2:
+            return math.nan
+        return float(stats.t.ppf(0.975, n - 1) * self.test.std(ddof=1) / math.sqrt(n))
+
+
+class Densities:
+    """The records of a comparison."""
+
+    def __init__(self, plan: Density, peers: Mapping[str, Peer], records: Sequence[Record]) -> None:
+        self.plan, self.peers = plan, peers
+        self._records: dict[tuple[str, str], list[Record]] = {}
+        for record in records:
+            self._records.setdefault((record.data_set, record.method), []).append(record)
+
+    @property
+    def tables(self) -> list[str]:
+        """Those of which something is reported."""
+        return [table for table in self.plan.tables if self.of(table)]
+
+    def label(self, method: str) -> str:
+        """For people."""
+        own: Model | Peer | None = self.plan.models.get(method) or self.peers.get(method)
+        return method if own is None else own.label
+
+    def reported(self, table: str, method: str) -> list[Record]:
+        """Records of the setting that was chosen, not those that chose it; one of all seeds, or one a seed."""
+        return [record for record in self._records.get((table, method), []) if "test" in record.measures]
+
+    def of(self, table: str) -> dict[str, Found]:
+        """What is reported on a table, models before peers."""
+        names = [name for name in (*self.plan.models, *self.peers) if self.reported(table, name)]
+        return {name: self._found(table, name) for name in names}
+
+    def _found(self, table: str, method: str) -> Found:
+        own = self.reported(table, method)
+
+        def last(name: str) -> NDArray[np.float64]:
+            found = [record.measured(name)[-1] for record in own if name in record.measures]
+            return np.concatenate(found) if found else np.array([math.nan])
+
+        up, down = last("test"), last("test_reverse")
+        n_seeds = len(up)
+        at = [int(record.measured("valid").mean(1).argmax()) for record in own]
+        train = [
+            record.measured("train")[i].mean()
+            for record, i in zip(own, at, strict=True)
+            if "train" in record.measures
+        ]
+        tried = {record.setting for record in self._records[table, method] if record.choosing}
+        return Found(
+            setting=json.loads(own[0].setting),
+            test=np.minimum(up, down),
+            gap=float((up - down)[np.abs(up - down).argmax()]),
+            standard_error=float(last("standard_error").max()),
+            valid=float(last("valid_best").mean()),
+            train=float(np.mean(train)) if train else math.nan,
+            independent=float(last("independent").mean()),
+            seconds=sum(record.seconds[-1] for record in own) / n_seeds,
+            tried=len(tried),
+        )
+
+    def best_model(self, table: str) -> str | None:
+        """The energy model that held-out rows like best, of those whose likelihood is known."""
+        found = {name: own for name, own in self.of(table).items() if name in self.plan.models and own.known}
+        return max(found, key=lambda name: found[name].valid, default=None)
+
+
+DENSITY_RULE = (
+    "Settings, passes and the energy model that speaks for a table are chosen by held-out rows; test rows are "
+    "looked at once. The energy model is ahead of the peers if its mean over seeds is higher than that of each of "
+    "them. A negative phase is worth its time if its mean is higher than that of the best CD or PCD (by held-out "
+    "rows) that takes at most a tenth more time (or of the quickest, where none does): Welch's t over seeds, "
+    "two-sided, p < .05 after Holm's correction for all these lines. A likelihood is given as a number where AIS "
+    f"and reverse AIS agree within {WITHIN:g} nat."
+)
+
+
+def density_verdicts(results: Densities, baselines: Sequence[str] = ("cd1", "cd10", "pcd")) -> list[Verdict]:
+    """Against the peers, a line a table; of the negative phases, a line a table and phase."""
+    return [*_against_peers(results), *_of_phases(results, baselines)]
+
+
+def _against_peers(results: Densities) -> list[Verdict]:
+    lines = []
+    for table in results.tables:
+        found, name = results.of(table), results.best_model(table)
+        peers = {peer: own for peer, own in found.items() if peer in results.peers and own.known}
+        if name is None or not peers:
+            continue
+        first = max(peers, key=lambda peer: peers[peer].mean)
+        place = 1 + sum(own.mean > found[name].mean for own in peers.values())
+        lines.append(
+            Verdict(
+                f"{table}: {results.label(name)} is ahead of all peers",
+                f"{found[name].mean:.2f} against {peers[first].mean:.2f} ({results.label(first)})",
+                f"place {place} of {len(peers) + 1}",
+                HOLDS if place == 1 else FAILS,
+            )
+        )
+    return lines
+
+
+def _of_phases(results: Densities, baselines: Sequence[str]) -> list[Verdict]:
+    pairs = []
+    for table in results.tables:
+        found = {name: own for name, own in results.of(table).items() if own.known}
+        basic = {name: found[name] for name in baselines if name in found}
+        for name, own in found.items():
+            model = results.plan.models.get(name)
+            if model is None or not model.compared or name in baselines or not basic:
+                continue
+            limit = max(1.1 * own.seconds, min(other.seconds for other in basic.values()))
+            able = {other: one for other, one in basic.items() if one.seconds <= limit}
+            pairs.append((table, name, own, *max(able.items(), key=lambda item: item[1].valid)))
+    tests = [stats.ttest_ind(own.test, other.test, equal_var=False) for _, _, own, _, other in pairs]
+    p_values = holm([1.0 if math.isnan(test.pvalue) else float(test.pvalue) for test in tests])
+    lines = []
+    for (table, name, own, against, other), test, p in zip(pairs, tests, p_values, strict=True):
+        gain = own.mean - other.mean
+        interval = (
+            test.confidence_interval() if len(own.test) > 1 and len(other.test) > 1 else (math.nan, math.nan)
+        )
+        lines.append(
+            Verdict(
+                f"{table}: {results.label(name)} beats {results.label(against)}",
+                f"{own.mean:.2f} against {other.mean:.2f}; {own.seconds:.0f} s and {other.seconds:.0f} s a seed",
+                f"{gain:+.2f} [{interval[0]:+.2f}, {interval[1]:+.2f}], p = {p:.2g}",
+                HOLDS if gain > 0 and p < 0.05 else FAILS,
+            )
+        )
+    return lines
+
+
+def density_table(results: Densities) -> list[list[str]]:
+    """A row for each table and method, with a header."""
+    header = ["table", "method", "test", "half of its 95 % interval", "seeds", "AIS less reverse AIS"]
+    rows = [
+        [*header, "standard error of log Z", "held out", "training", "seconds a seed", "chosen", "settings tried"]
+    ]
+    for table in results.tables:
+        found = results.of(table)
+        independent = [own.independent for own in found.values() if math.isfinite(own.independent)]
+        if independent:
+            rows.append([table, "independent bits", f"{independent[0]:.3f}", *[""] * 9])
+        for name, own in found.items():
+            cells = [f"{own.half_width:.3f}", str(len(own.test)), f"{own.gap:.3f}", f"{own.standard_error:.3f}"]
+            measured = [f"{own.valid:.3f}", f"{own.train:.3f}", f"{own.seconds:.1f}"]
+            chosen = " ".join(f"{key}={value}" for key, value in own.setting.items())
+            value = f"{own.mean:.3f}" if own.known else "not known"
+            rows.append([table, results.label(name), value, *cells, *measured, chosen, str(own.tried)])
+    return [[cell.replace("nan", "") for cell in row] for row in rows]
+
+
+def read_densities(folder: Path) -> Densities:
+    """Read the folder of a run of ``experiment=density``; a FileNotFoundError if it holds none."""
+    path = folder / "density.json"
+    if not path.exists():
+        raise FileNotFoundError(f"{folder} holds no density.json: name the folder of experiment=density.")
+    settings = json.loads(path.read_text(encoding="utf-8"))
+    peers = {name: Peer(**own) for name, own in settings.pop("found_peers").items()}
+    models = {name: Model(**own) for name, own in settings.pop("models").items()}
+    return Densities(Density(**settings, models=models), peers, Records(folder).all)

@@ -1,0 +1,156 @@
+"""A training of an energy model on a table, measured on the way by held-out rows, and at its end by test rows."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from memcomp_lightning import rng
+from memcomp_lightning.ambient import in_one_thread
+from memcomp_lightning.errors import SettingError
+from memcomp_lightning.likelihood import log_likelihood_or_bound, log_partition_function
+from memcomp_lightning.likelihood.both_ways import estimate_both_ways
+from memcomp_lightning.models import EnergyModel, stacked
+from memcomp_lightning.samplers import positive_phase
+from memcomp_lightning.studies.accuracy import Progress
+from memcomp_lightning.studies.density.settings import Density
+from memcomp_lightning.studies.measures.gradient_bias import mean_gradient, without_diverged
+from memcomp_lightning.studies.plan import Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.records import Record
+from memcomp_lightning.training import DivergedError
+from memcomp_lightning.training.best import BestPass
+
+ENUMERATED = 20
+"""Units of the smaller layer up to which log Z is exact."""
+
+SWEEPS = 200
+"""From training rows to the states from which reverse AIS starts."""
+
+
+class Scores(NamedTuple):
+    """Mean log-likelihood of rows in nats by both estimates of log Z, and how good these are; ``(*replicas,)``.
+
+    Attributes:
+        up: By AIS, which tends to flatter; exact where log Z is.
+        down: By reverse AIS.
+        standard_error: Of the larger of both.
+    """
+
+    up: Tensor
+    down: Tensor
+    standard_error: Tensor
+
+    @property
+    def least(self) -> Tensor:
+        """The lower of both, which flatters no model."""
+        return torch.minimum(self.up, self.down)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityTrial(Trial):
+    """All seeds of one model at one setting on one table.
+
+    Attributes:
+        density: What it is part of.
+        seeds: Of the replicas.
+        points: Passes after which they are measured; the last one ends training.
+    """
+
+    density: Density
+    seeds: tuple[int, ...]
+    points: tuple[int, ...]
+
+    @property
+    def n_updates(self) -> int:
+        """Of the progress bar: passes."""
+        return self.points[-1]
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        return f"{self.data_set}, {self.method}, {self.setting}"
+
+    @in_one_thread()
+    def run(self, progress: Progress) -> list[Record]:
+        """Train until held-out rows say stop; test rows are looked at once, and never where a setting is chosen.
+
+        It runs on one thread and counts seconds of the processor; measurements do not count.
+        """
+        plans = [self.build({**self.settings, "seed": seed}) for seed in self.seeds]
+        stage, module = pretraining_of(plans[0])
+        network, data = stacked([plan.network for plan in plans], ()), stage.data
+        batches = data.train_batches(0, 1).repeated(self.seeds)
+        assert plans[0].stage_for is not None
+        own_stage = plans[0].stage_for(network)
+        trained = cast(Any, own_stage.phases[0].model)
+        _warm_up(trained, module.sampler, next(iter(batches)).v)
+        (train, _), (held_out, _) = data.train, data.heldout
+        measured = dict[str, list[list[float]]](valid=[], train=[], log_z_gap=[])
+        record = Record.of(self, at=[], seconds=[], measures=measured)
+        updates, best = sum(batch.closes_step for batch in batches), BestPass(patience=self.density.patience)
+        seconds, begin, reported = 0.0, time.process_time(), 0
+        try:
+            for done in passes_without_trainer(module, batches, stage=own_stage, seed=self.seeds[0]):
+                if done.number not in self.points:
+                    continue
+                seconds += time.process_time() - begin
+                progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
+                reported = done.number
+                model, diverged = without_diverged(trained)
+                of_rows = scores_of(model, train, [held_out, train], self.density.quick_betas, self.density.chains)
+                valid = of_rows[0].least.masked_fill(diverged, -math.inf)
+                best.offer(valid, trained.state_dict())
+                record.at.append(done.number * updates)
+                record.seconds.append(seconds)
+                for name, value in zip(
+                    measured, (valid, of_rows[1].least, of_rows[0].up - of_rows[0].down), strict=True
+                ):
+                    measured[name].append(value.tolist())
+                if best.over:
+                    break
+                begin = time.process_time()
+        except (DivergedError, SettingError):  # the second is a solver's that is given NaN
+            pass
+        progress(self.title, self.points[-1] - reported)
+        if best.value is None:
+            return [replace(record, held_out=-math.inf)]
+        record = replace(record, held_out=float(best.value.median()))
+        if self.choosing:
+            return [record]
+        trained.load_state_dict(best.weights)
+        (test, _), betas = data.test, self.density.betas
+        scores = scores_of(trained, train, [test, held_out], betas, 2 * self.density.chains)
+        base = _independent(train, test)
+        found = {"test": scores[0].up, "test_reverse": scores[0].down, "standard_error": scores[0].standard_error}
+        found |= {"valid_best": scores[1].least, "independent": base.expand_as(scores[0].up)}
+        return [replace(record, measures={**measured, **{name: [x.tolist()] for name, x in found.items()}})]
+
+
+@torch.no_grad()
+def scores_of(model: EnergyModel, train: Tensor, rows: Sequence[Tensor], betas: int, chains: int) -> list[Scores]:
+    """Scores of sets of rows, by one log Z; exact where the smaller layer is small enough."""
+    if model.n_enumerated <= ENUMERATED:
+        up = down = log_partition_function(model)
+        error = torch.zeros_like(up)
+    else:
+        found = estimate_both_ways(model, train, n_chains=chains, n_betas=betas, n_sweeps=SWEEPS, seed=0)
+        up, down, error = found.up.log_z, found.down.log_z, found.standard_error
+    of_rows = [log_likelihood_or_bound(model, v, torch.zeros_like(up)).double().mean(-1) for v in rows]
+    return [Scores(mean - up, mean - down, error) for mean in of_rows]
+
+
+def _independent(train: Tensor, test: Tensor) -> Tensor:
+    """Mean log-likelihood of test rows by independent bits with the means of the training rows, one more each."""
+    p = (train.double().sum(0) + 1) / (len(train) + 2)
+    return torch.where(test > 0.5, p.log(), (-p).log1p()).sum(-1).mean()
+
+
+def _warm_up(model: EnergyModel, sampler: Any, v: Tensor) -> None:
+    """Compile and load what the first updates need, outside the time that is compared."""
+    generator = rng.stream(0, "warm-up")
+    state = sampler.init(model, v.shape[-2], generator=generator)
+    mean_gradient(model, sampler, state, positive_phase(model, v), 1, generator=generator)
