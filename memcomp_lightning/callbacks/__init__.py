@@ -1,5 +1,6 @@
 """Callbacks that log, draw or guard training; :mod:`memcomp_lightning.callbacks.base` says what they need."""
 
+from memcomp_lightning.callbacks.best_likelihood import BestLikelihood
 from memcomp_lightning.callbacks.best_weights import BestWeights
 from memcomp_lightning.callbacks.chain_pictures import ChainPictures
 from memcomp_lightning.callbacks.classification import ClassificationMetrics
@@ -29,6 +30,7 @@ from memcomp_lightning.callbacks.still_falling import StillFalling
 from memcomp_lightning.callbacks.trajectory_figure import TrajectoryFigure
 
 __all__ = [
+    "BestLikelihood",
     "BestWeights",
     "ChainPictures",
     "ClassificationMetrics",

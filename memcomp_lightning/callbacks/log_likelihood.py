@@ -1,7 +1,8 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
+import logging
 import math
-from typing import Any, Literal, TypedDict
+from typing import Any, ClassVar, Literal, TypedDict
 
 import lightning.pytorch as pl
 import torch
@@ -16,12 +17,14 @@ from memcomp_lightning.callbacks.base import (
     log_scalars,
     mask_of_step,
     model_of,
+    prefix_of,
     require_enumerable,
     required,
 )
+from memcomp_lightning.callbacks.sampler_diagnostics import chains_persist
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
-from memcomp_lightning.models import EnergyModel
+from memcomp_lightning.models import RBM, EnergyModel
 from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.observed import visible_units_coupled
 
@@ -30,6 +33,12 @@ QUICKLY_ENUMERATED = 16
 
 QUICKLY_ANNEALED = 10**10
 """Products of a unit and a weight in all chains and steps of AIS that "auto" computes at most: about a second."""
+
+
+MOST_BEHIND = 1.0
+"""Nats by which log Z from the sampler's chains may stay below log Z by annealing."""
+
+log = logging.getLogger(__name__)
 
 
 class LikelihoodValue(TypedDict):
@@ -41,6 +50,7 @@ class LikelihoodValue(TypedDict):
         method: "exact" or "ais", as log Z was found.
         train: Nats an image of the training images, one number a replica.
         heldout: The same of held-out images; empty if there was no validation at the end of the pass.
+        gap: Nats by which log Z from persistent chains is too low, one number a replica; empty without them.
     """
 
     layer: int
@@ -48,6 +58,7 @@ class LikelihoodValue(TypedDict):
     method: str
     train: list[float]
     heldout: list[float]
+    gap: list[float]
 
 
 class LogLikelihood(EveryIterations):
@@ -67,6 +78,12 @@ class LogLikelihood(EveryIterations):
     the training images. Its estimate of log Z tends to be too small, and the likelihood too large;
     ``log_z_standard_error`` and ``log_z_effective_sample_size`` (out of ``n_chains``) say how far to trust it.
 
+    Where chains persist from update to update (PCD, parallel tempering), reverse AIS begins at them, and the
+    larger log Z of both counts, which flatters no model. ``log_z_gap``, log Z by annealing less that from the
+    chains, is about 0 while the chains are samples of the model. Where they have stopped mixing they miss a part
+    of its states, and the gap grows, to ten nats and more: training then makes the likelihood worse. At two looks
+    in a row above ``MOST_BEHIND`` nats, or at the last one, a warning names the remedy.
+
     Attributes:
         history: Every value so far, the oldest first; checkpoints keep it.
 
@@ -83,6 +100,8 @@ class LogLikelihood(EveryIterations):
     Raises:
         SettingError: A setting out of range; at the start of training, a layer too large to enumerate.
     """
+
+    looks_a_stage: ClassVar[int] = 10
 
     def __init__(
         self,
@@ -111,11 +130,12 @@ class LogLikelihood(EveryIterations):
         self._heldout: list[tuple[Tensor, int]] = []
         self._judged_at = -1
         self._bits: Generator | None = None
+        self._behind = 0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Refuse models too large to enumerate; settle how often to look."""
         if self._about_ten:
-            self.every = max(1, (trainer.max_epochs or 1) // 10)
+            self.every = max(1, (trainer.max_epochs or 1) // self.looks_a_stage)
         if self.method == "exact":
             require_enumerable(self, pl_module, self.max_units)
 
@@ -161,7 +181,7 @@ class LogLikelihood(EveryIterations):
                 "memcomp-score gives likelihoods of others"
             )
             return
-        values = self._partition_function(model, method, train, observed)
+        values = self._partition_function(model, method, train, observed, _chains_of(pl_module, outputs))
         log_z = values["log_z"]
         if train is not None:
             total = self._total(model, train, observed, rng.stream(self.seed, "log_likelihood", 0))
@@ -172,6 +192,8 @@ class LogLikelihood(EveryIterations):
             n_images = sum(n for _, n in self._heldout)
             values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
         log_scalars(pl_module, values)
+        gap = values.get("log_z_gap")
+        self._say_if_behind(trainer, pl_module, gap)
         self.history.append(
             LikelihoodValue(
                 layer=int(getattr(pl_module, "layer", 0)),
@@ -179,6 +201,7 @@ class LogLikelihood(EveryIterations):
                 method=method,
                 train=values["log_likelihood_train"].flatten().tolist() if train is not None else [],
                 heldout=values["log_likelihood_heldout"].flatten().tolist() if judged else [],
+                gap=[] if gap is None else gap.flatten().tolist(),
             )
         )
 
@@ -205,19 +228,37 @@ class LogLikelihood(EveryIterations):
         return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
 
     def _partition_function(
-        self, model: EnergyModel, method: str, train: Tensor | None, observed: Tensor | None
+        self, model: EnergyModel, method: str, train: Tensor | None, observed: Tensor | None, chains: Tensor | None
     ) -> dict[str, Tensor]:
-        """``log_z`` and, where it is an estimate, how good it is."""
-        if method == "exact":
-            return {"log_z": likelihood.log_partition_function(model, max_units=self.max_units)}
-        ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
+        """``log_z`` and, where it is an estimate, how good it is; ``log_z_gap`` where chains persist."""
         base = None if train is None else likelihood.base_of(train, model.visible, observed)
+        down = None
+        if chains is not None and isinstance(model, RBM):
+            reverse, generator = likelihood.ReverseAis(n_betas=self.n_betas), rng.stream(self.seed, "from chains")
+            down = reverse.estimate(model, chains, generator=generator, base=base).log_z
+        if method == "exact":
+            log_z = likelihood.log_partition_function(model, max_units=self.max_units)
+            return {"log_z": log_z} if down is None else {"log_z": log_z, "log_z_gap": log_z - down}
+        ais = likelihood.Ais(n_chains=self.n_chains, n_betas=self.n_betas)
         estimate = ais.estimate(model, generator=rng.stream(self.seed, "log_likelihood", 2), base=base)
-        return {
+        values = {
             "log_z": estimate.log_z,
             "log_z_standard_error": estimate.standard_error,
             "log_z_effective_sample_size": estimate.effective_sample_size,
         }
+        if down is not None:
+            values |= {"log_z": torch.maximum(estimate.log_z, down), "log_z_gap": estimate.log_z - down}
+        return values
+
+    def _say_if_behind(self, trainer: pl.Trainer, module: pl.LightningModule, gap: Tensor | None) -> None:
+        """Warn where the chains are no samples of the model any more, once a model."""
+        if gap is None:
+            return
+        worst, done = float(gap.max()), iteration_of(module) + 1
+        self._behind = self._behind + 1 if worst > MOST_BEHIND else 0
+        is_last = done == getattr(module, "iterations", None)
+        if self._behind == 2 or (is_last and self._behind == 1):
+            log.warning("%s, pass %d: %s", prefix_of(module), done, behind(worst))
 
     @staticmethod
     def _total(model: EnergyModel, v: Tensor, observed: Tensor | None, bits: Generator) -> Tensor:
@@ -227,6 +268,24 @@ class LogLikelihood(EveryIterations):
         if observed is not None:
             return likelihood.log_likelihood(model, v, log_z, observed=observed).sum(-1)
         return likelihood.log_likelihood_or_bound(model, v, log_z).double().sum(-1)
+
+
+def behind(gap: float) -> str:
+    """What a gap above :data:`MOST_BEHIND` means, and what to do."""
+    return (
+        f"the chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing, and the "
+        "likelihood falls where that goes on. Let the learning rate fall (pretrain=falling), take more chains "
+        "(sampler.n_chains=500), or chains at several temperatures (sampler=parallel_tempering)."
+    )
+
+
+def _chains_of(module: pl.LightningModule, outputs: object) -> Tensor | None:
+    """Visible states of chains that go on from update to update; None without."""
+    negative = outputs.get("negative") if isinstance(outputs, dict) else None
+    if negative is None or negative.weight is not None or negative.v.shape[-2] < 2 or not chains_persist(module):
+        return None
+    v: Tensor = negative.v
+    return v
 
 
 def sums_missing(model: EnergyModel, observed: Tensor | None) -> bool:

@@ -50,7 +50,7 @@ class SamplerDiagnostics(EveryIterations):
         log_scalars(pl_module, tagged, of_first_process=True)
 
     def _mixing(self, module: pl.LightningModule, negative: Configurations) -> dict[str, Tensor]:
-        if negative.weight is not None or not _chains_persist(module):
+        if negative.weight is not None or not chains_persist(module):
             return {}
         if prefix_of(module) != self._stage or self._v is None or self._v.shape != negative.v.shape:
             self._stage, self._energies, self._v = prefix_of(module), [], None
@@ -115,7 +115,8 @@ def autocorrelation_time(series: Tensor) -> Tensor:
     return time.take_along_dim(enough.int().argmax(-1, keepdim=True), dim=-1).squeeze(-1)
 
 
-def _chains_persist(module: pl.LightningModule) -> bool:
+def chains_persist(module: pl.LightningModule) -> bool:
+    """Whether the sampler's chains go on from update to update."""
     init = getattr(getattr(module, "sampler", None), "init", None)
     if init is None:
         return True

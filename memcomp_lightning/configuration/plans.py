@@ -19,7 +19,14 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
 from memcomp_lightning import rng
-from memcomp_lightning.callbacks import BestWeights, Schedules, StageProgressBar, StillFalling
+from memcomp_lightning.callbacks import (
+    BestLikelihood,
+    BestWeights,
+    LogLikelihood,
+    Schedules,
+    StageProgressBar,
+    StillFalling,
+)
 from memcomp_lightning.configuration.composition import STUDIES
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import in_words
@@ -53,11 +60,24 @@ _STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
     "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", *STUDIES),
     "data": ("source", *_DEALT),
-    "pretrain": (*_STAGE_SETTINGS, "initial_bias", "centring", "penalties", "stage"),
+    "pretrain": (
+        *_STAGE_SETTINGS,
+        "updates",
+        "initial_bias",
+        "centring",
+        "penalties",
+        "stage",
+        "keep_best",
+        "patience",
+    ),
     "finetune": (*_STAGE_SETTINGS, "loss", "units", "labels", "class_weights", "dropout", *_STOPPING),
     "callbacks": ("pretrain", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
+
+
+FEWEST_PASSES = 10
+"""Of pretraining whose length is given in updates."""
 
 
 def build(config: DictConfig) -> Plan:
@@ -87,12 +107,14 @@ def build(config: DictConfig) -> Plan:
     network = network_of(config, shape)
     if earlier is not None and earlier.weights == "pretrain":
         earlier.give(network)
-    for stage in ("pretrain", "finetune"):
-        require_count(f"{stage}.iterations", config[stage].iterations, minimum=0)
+    require_count("finetune.iterations", config.finetune.iterations, minimum=0)
     pretraining = finetuning = stage_for = None
     models = energy_models(network)
-    if models and config.pretrain.iterations > 0:
+    if models and config.pretrain.iterations != 0:
         callbacks, rows = _callbacks(config, "pretrain"), _data(config, "pretrain", data, units)
+        iterations = _passes(config, rows)
+        if config.pretrain.keep_best:
+            callbacks = _with_best_likelihood(config, rows, callbacks)
         centring = _part(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
@@ -101,7 +123,7 @@ def build(config: DictConfig) -> Plan:
         if initial_bias == "data" and config.model.weights is None and earlier is None:
             some = rows.some_train()
             start_at_means(models[0], some.v, some.observed, some.weight)
-        schedules = _schedules(config, "pretrain")
+        schedules = _schedules(config, "pretrain", iterations)
         stage_for = instantiate(config.pretrain.stage)
         try:
             stage = stage_for(network)
@@ -109,8 +131,8 @@ def build(config: DictConfig) -> Plan:
             raise UserError(f"pretrain.stage: {error}") from error
         module = EnergyPretraining(
             stage,
-            _sampler(config, rows),
-            iterations=config.pretrain.iterations,
+            _sampler(config, rows, iterations),
+            iterations=iterations,
             optimizer=_optimizer(config, "pretrain", schedules),
             schedules=schedules,
             centring=centring,
@@ -147,7 +169,7 @@ def classifier_of(
     config: DictConfig, network: nn.Module, n_classes: int, *, class_weights: torch.Tensor | None = None
 ) -> Classifier:
     """The fine-tuning of a network."""
-    schedules = _schedules(config, "finetune")
+    schedules = _schedules(config, "finetune", config.finetune.iterations)
     make: Callable[..., Classifier] = partial(Classifier, network)
     if isinstance(network, DBN):
         make = partial(
@@ -224,10 +246,13 @@ def _part(settings: object, name: str) -> Any:
     return instantiate(settings)
 
 
-def _schedules(config: DictConfig, stage: str) -> list[Schedule]:
-    """What changes the optimiser of a stage from pass to pass."""
+def _schedules(config: DictConfig, stage: str, iterations: int) -> list[Schedule]:
+    """What changes the optimiser of a stage from pass to pass; n_passes null is all of them."""
     found = []
     for name, settings in (config[stage].schedules or {}).items():
+        if isinstance(settings, DictConfig) and settings.get("n_passes", 0) is None:
+            settings = copy.deepcopy(settings)
+            settings.n_passes = max(iterations, 1)
         schedule = _part(settings, f"{stage}.schedules.{name}")
         if schedule is not None:
             require_parts(f"{stage}.schedules.{name}", schedule, "schedule", ("check", "begin_pass"))
@@ -339,12 +364,39 @@ def network_of(config: DictConfig, shape: Shape) -> nn.Module:
     return network
 
 
-def _sampler(config: DictConfig, data: RowsDataModule) -> Any:
+def _passes(config: DictConfig, rows: RowsDataModule) -> int:
+    """Passes of pretraining: as many as are typed, or as make up the updates, ten at least."""
+    iterations, updates = config.pretrain.iterations, config.pretrain.updates
+    if iterations is not None or updates is None:
+        require_count("pretrain.iterations", iterations)
+        return int(iterations)
+    require_count("pretrain.updates", updates)
+    return max(FEWEST_PASSES, round(int(updates) / _updates_a_pass(config, rows)))
+
+
+def _updates_a_pass(config: DictConfig, rows: RowsDataModule) -> int:
+    size = cast("int | None", config.pretrain.batch_size)
+    return math.ceil(rows.n_train / min(size or rows.n_train, rows.n_train))
+
+
+def _with_best_likelihood(
+    config: DictConfig, rows: RowsDataModule, callbacks: list[pl.Callback]
+) -> list[pl.Callback]:
+    """The callbacks with one that keeps the best weights in the place of the one that measures likelihoods."""
+    if not rows.holds_out:
+        require_held_out(config, "where pretrain.keep_best is true", "pass")
+    own = config.callbacks.pretrain.get("log_likelihood") or {}
+    settings = {str(name): value for name, value in own.items() if name != "_target_"}
+    best = BestLikelihood(**settings, patience=config.pretrain.patience)
+    return [*(callback for callback in callbacks if not isinstance(callback, LogLikelihood)), best]
+
+
+def _sampler(config: DictConfig, data: RowsDataModule, iterations: int) -> Any:
     """The sampler; the schedule of mode assistance spans all updates of a layer unless it says otherwise."""
     settings = copy.deepcopy(config.sampler)
     schedule, size = settings.get("schedule"), min(config.pretrain.batch_size or data.n_train, data.n_train)
     if schedule is not None and schedule.get("n_updates") is None:
-        schedule.n_updates = config.pretrain.iterations * math.ceil(data.n_train / size)
+        schedule.n_updates = iterations * _updates_a_pass(config, data)
     sampler = instantiate(settings)
     if isinstance(sampler, ModeAssisted):
         chunk = config.data.chunk_size
