@@ -16,9 +16,9 @@ from trees import Tree, chow_liu_tree
 
 Single = NDArray[np.float32]
 
-_ROWS_AT_ONCE = 1000
-_ONLINE_PASSES, _FULL_PASSES, _PATIENCE = 20, 60, 4
-_LEAST_GAIN = 1e-3
+_NUMBERS_AT_ONCE = 8000  # of rows times states: messages of one column then fit the cache
+_ONLINE_PASSES, _FULL_PASSES, _PATIENCE = 20, 80, 6
+_LEAST_GAIN = 3e-4
 
 
 class Tables(NamedTuple):
@@ -91,20 +91,31 @@ def maximised(counts: Tables, pseudocount: float, means: Real) -> Tables:
     )
 
 
-def first_tables(states: int, means: Real, generator: np.random.Generator) -> Tables:
-    """Random: steps from a flat Dirichlet distribution, bits around the means of their columns."""
-    start = generator.dirichlet(np.ones(states))
-    step = generator.dirichlet(np.ones(states), size=(len(means), states))
-    one = np.clip(means[:, None] + generator.uniform(-0.5, 0.5, (len(means), states)) * 0.8, 0.05, 0.95)
+def first_tables(states: int, train: Rows, means: Real, generator: np.random.Generator) -> Tables:
+    """A state is a random row of the table, the same one in all columns, and steps keep it half of the time.
+
+    From random tables EM ends lower: on plants by half a nat, on mushrooms by two tenths to a nat.
+    """
+    n = train.shape[1]
+    rows = train[generator.choice(len(train), states, replace=len(train) < states)]
+    one = 0.8 * (0.15 + 0.7 * rows.T) + 0.2 * means[:, None]
+    step = 0.5 * np.eye(states) + 0.5 * generator.dirichlet(np.ones(states), size=(n, states))
+    start = generator.dirichlet(np.full(states, 5.0))
     return Tables(
         start.astype(np.float32), step.astype(np.float32), np.stack([1 - one, one], axis=2).astype(np.float32)
     )
 
 
+def blocks(rows: Rows, states: int) -> list[Rows]:
+    """The rows in parts."""
+    at_once = max(_NUMBERS_AT_ONCE // states, 1)
+    return [rows[k : k + at_once] for k in range(0, len(rows), at_once)]
+
+
 def log_likelihood(tables: Tables, tree: Tree, rows: Rows) -> Real:
     """Of each row, in nats, ``(n,)``."""
-    blocks = range(0, len(rows), _ROWS_AT_ONCE)
-    return np.concatenate([upward(tables, tree, rows[k : k + _ROWS_AT_ONCE]).log_likelihood for k in blocks])
+    parts = blocks(rows, len(tables.start))
+    return np.concatenate([upward(tables, tree, part).log_likelihood for part in parts])
 
 
 def hidden_tree(train: Rows, valid: Rows, *, seed: int, states: int, pseudocount: float) -> Fitted:
@@ -112,7 +123,7 @@ def hidden_tree(train: Rows, valid: Rows, *, seed: int, states: int, pseudocount
     generator = np.random.default_rng(seed)
     means = smoothed_means(train, 1.0)
     tree = chow_liu_tree(train, 1.0)
-    now = first_tables(states, means, generator)
+    now = first_tables(states, train, means, generator)
     best, best_valid, waited = now, -np.inf, 0
 
     def better() -> bool:
@@ -123,11 +134,11 @@ def hidden_tree(train: Rows, valid: Rows, *, seed: int, states: int, pseudocount
             best, best_valid = now, reached
         return waited < _PATIENCE
 
-    at_once = int(np.clip(len(train) // 10, 50, _ROWS_AT_ONCE))
+    n_batches = max(len(blocks(train, states)), min(10, len(train) // 50), 1)
     kept: Tables | None = None
     updates = 0
     for _ in range(_ONLINE_PASSES):
-        for part in np.array_split(generator.permutation(len(train)), len(train) // at_once):
+        for part in np.array_split(generator.permutation(len(train)), n_batches):
             counts, _ = expected_counts(now, tree, train[part])
             updates += 1
             weight = (updates + 1) ** -0.6
@@ -140,8 +151,7 @@ def hidden_tree(train: Rows, valid: Rows, *, seed: int, states: int, pseudocount
     waited = 0
     now = best
     for _ in range(_FULL_PASSES):
-        blocks = range(0, len(train), _ROWS_AT_ONCE)
-        sums = [expected_counts(now, tree, train[k : k + _ROWS_AT_ONCE])[0] for k in blocks]
+        sums = [expected_counts(now, tree, part)[0] for part in blocks(train, states)]
         now = maximised(Tables(*(sum(parts) for parts in zip(*sums, strict=True))), pseudocount, means)
         if not better():
             break
