@@ -1,8 +1,9 @@
 """Two learners of deeprob-kit: sum-product networks (LearnSPN), and ensembles of random cutset networks.
 
-    LearnSPN    R. Gens and P. Domingos, "Learning the structure of sum-product networks", ICML 2013
-    ensembles   N. Di Mauro et al., "Random probabilistic circuits", UAI 2021: the package's XPC, deterministic and with
-                Chow-Liu trees as leaves, which is a cutset network whose cuts are drawn; their mean is the ensemble
+LearnSPN    R. Gens and P. Domingos, "Learning the structure of sum-product networks", ICML 2013
+    ensembles   N. Di Mauro et al., "Random probabilistic circuits", UAI 2021: the package's XPC, deterministic and
+                with Chow-Liu trees as leaves, which is a cutset network whose cuts are drawn; their mean is the
+                ensemble
 """
 
 import contextlib
@@ -41,8 +42,8 @@ def split_columns(
 ) -> NDArray[np.int64]:
     """The columns that a chain of dependent pairs joins to a random one, against the others.
 
-    That is deeprob's "gvs" with the same threshold, G < 2 p. It counts each pair in a histogram of its own, which takes
-    minutes where this takes one matrix product.
+    That is deeprob's "gvs" with the same threshold, G < 2 p. It counts each pair in a histogram of its own, and
+    then LearnSPN takes 27 s on nltcs; by one matrix product it takes half a second.
     """
     dependent = g_statistic(rows) >= 2 * p
     _, label = connected_components(dependent, directed=False)
@@ -81,10 +82,10 @@ def sum_product(
 def cutset_ensemble(
     train: Rows, valid: Rows, *, seed: int, min_rows: int, networks: int, cut: int, smoothing: float
 ) -> Fitted:
-    """``networks`` random cutset networks of equal weight; a node asks for the values of ``cut`` columns at once."""
+    """``networks`` random cutset networks of equal weight; a node cuts by the values of ``cut`` columns."""
     n = train.shape[1]
     # The package shuffles columns with numpy's global generator, and prints its progress.
-    np.random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002, TID251
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         root = learn_estimator(

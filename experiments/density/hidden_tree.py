@@ -1,10 +1,10 @@
-"""A hidden Chow-Liu tree: a latent of h states for each column, and between these latents the tree of Chow and Liu.
+"""A hidden Chow-Liu tree: a latent of h states for each column, and between latents the tree of Chow and Liu.
 
     p(x) = sum over z of p(z_r) prod_i p(z_i | z_parent(i)) prod_i p(x_i | z_i)
 
-Source: A. Liu and G. Van den Broeck, "Tractable regularization of probabilistic circuits", NeurIPS 2021. Messages are
-exact; they are divided by their sum at every column, and the logarithms of these sums add up to log p(x). Learned by
-EM, first of mini-batches with a falling step, then of all rows.
+Source: A. Liu and G. Van den Broeck, "Tractable regularization of probabilistic circuits", NeurIPS 2021. Messages
+are exact; they are divided by their sum at every column, and the logarithms of these sums add up to log p(x).
+Learned by EM, first of mini-batches with a falling step, then of all rows.
 """
 
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Tables(NamedTuple):
 
 
 class Upward(NamedTuple):
-    """Messages towards the root for n rows: ``belief`` and ``message`` are ``(n_visible, h, n)``, log p(x) ``(n,)``."""
+    """Messages towards the root for n rows: ``belief``, ``message`` ``(n_visible, h, n)``, log p(x) ``(n,)``."""
 
     belief: Single
     message: Single
@@ -45,7 +45,8 @@ class Upward(NamedTuple):
 
 def upward(tables: Tables, tree: Tree, rows: Rows) -> Upward:
     """Belief in a state from what is below it, scaled to sum 1, and what the parent hears of it."""
-    belief = np.take_along_axis(tables.bit[:, :, None, :], rows.T[:, None, :, None].astype(np.int64), axis=3)[..., 0]
+    x = rows.T[:, None, :, None].astype(np.int64)
+    belief = np.take_along_axis(tables.bit[:, :, None, :], x, axis=3)[..., 0]
     message = np.empty_like(belief)
     log_likelihood = np.zeros(len(rows))
     for i in tree.order[:0:-1]:
@@ -79,7 +80,7 @@ def expected_counts(tables: Tables, tree: Tree, rows: Rows) -> tuple[Tables, flo
 
 
 def maximised(counts: Tables, pseudocount: float, means: Real) -> Tables:
-    """Tables from counts, each state with ``pseudocount`` rows more: even steps, and bits like the whole table's."""
+    """Tables from counts, each state with ``pseudocount`` rows more: even steps, bits like the whole table's."""
     prior = pseudocount * np.stack([1 - means, means], axis=1)[:, None]
     start = counts.start + pseudocount / len(counts.start)
     step = counts.step + pseudocount / len(counts.start)

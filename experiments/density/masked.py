@@ -3,8 +3,8 @@
     log p(x) = sum_i log p(x_i | x of columns that come before i in an order)
 
 Source: M. Germain, K. Gregor, I. Murray and H. Larochelle, "MADE: Masked autoencoder for distribution estimation",
-ICML 2015, with the direct connections of its section 4.1 and the training over several orders of its section 4.2: one
-set of weights, another mask at each update, and as the model the mean of the distributions of all masks.
+ICML 2015, with direct connections from inputs to outputs, and with its training over several orders: one set of
+weights, another mask at each update, and as the model the mean of the distributions of all masks.
 """
 
 import copy
@@ -19,7 +19,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, linear
 torch.set_num_threads(1)
 
 _BATCH = 100
-_UPDATES, _UPDATES_AT_LEAST_BETWEEN, _PATIENCE = 12_000, 100, 15
+_UPDATES, _UPDATES_AT_LEAST_BETWEEN, _PATIENCE = 20_000, 100, 15
 _ROWS_AT_ONCE = 2000
 
 
@@ -47,7 +47,7 @@ class MaskedNetwork(nn.Module):
 
         def uniform(rows: int, columns: int) -> nn.Parameter:
             bound = math.sqrt(6 / (rows + columns))
-            return nn.Parameter((2 * torch.rand(rows, columns, generator=generator) - 1) * bound)
+            return nn.Parameter(torch.empty(rows, columns).uniform_(-bound, bound, generator=generator))
 
         self.enter, self.leave = uniform(n_hidden, n), uniform(n, n_hidden)
         self.direct = nn.Parameter(torch.zeros(n, n))
@@ -76,23 +76,38 @@ class MaskedNetwork(nn.Module):
         return np.asarray(total.double().numpy())
 
 
+class Adam:
+    """Adam with decoupled weight decay of matrices; torch's own imports sympy at its first step, for a second."""
+
+    def __init__(self, network: nn.Module, rate: float, decay: float) -> None:
+        self.rate, self.decay, self.steps = rate, decay, 0
+        self.parameters = list(network.parameters())
+        self.mean = [torch.zeros_like(p) for p in self.parameters]
+        self.square = [torch.zeros_like(p) for p in self.parameters]
+
+    def step(self, loss: Tensor) -> None:
+        gradients = torch.autograd.grad(loss, self.parameters)
+        self.steps += 1
+        rate = self.rate * math.sqrt(1 - 0.999**self.steps) / (1 - 0.9**self.steps)
+        with torch.no_grad():
+            for p, g, mean, square in zip(self.parameters, gradients, self.mean, self.square, strict=True):
+                mean.lerp_(g, 0.1)
+                square.mul_(0.999).addcmul_(g, g, value=0.001)
+                if p.dim() == 2:
+                    p.mul_(1 - self.rate * self.decay)
+                p.addcdiv_(mean, square.sqrt().add_(1e-8), value=-rate)
+
+
 def masked(train: Rows, valid: Rows, *, seed: int, masks: int, hidden: int, rate: float, decay: float) -> Fitted:
     """Adam with decoupled weight decay, mini-batches of 100; the best weights on the validation rows are kept."""
     generator = torch.Generator().manual_seed(seed)
     network = MaskedNetwork(smoothed_means(train, 1.0), hidden, masks, generator)
-    matrices = [network.enter, network.leave, network.direct]
-    optimiser = torch.optim.AdamW(
-        [{"params": matrices, "weight_decay": decay}, {"params": [network.hidden, network.out], "weight_decay": 0.0}],
-        lr=rate,
-    )
+    optimiser = Adam(network, rate, decay)
     x = torch.from_numpy(train).float()
     best, best_valid, waited, updates, last = copy.deepcopy(network.state_dict()), -math.inf, 0, 0, 0
     while updates < _UPDATES and waited < _PATIENCE:
         for part in torch.randperm(len(x), generator=generator).split(_BATCH):
-            optimiser.zero_grad(set_to_none=True)
-            loss = -network.of_mask(x[part], network.masks[updates % masks]).mean()
-            loss.backward()
-            optimiser.step()
+            optimiser.step(-network.of_mask(x[part], network.masks[updates % masks]).mean())
             updates += 1
         if updates - last < _UPDATES_AT_LEAST_BETWEEN:
             continue

@@ -13,16 +13,16 @@ PEERS is an environment of its own, without memcomp_lightning:
 
 The last one stands alone because it asks for torchvision, which nothing here uses.
 
-`--list` prints a JSON object, name -> {"label": for people, "axes": {setting: [values in order]}, "start": {setting:
-value}, "likelihood": "exact" or "rbm", "missing": null or the pip line of what is not installed}. Axes stand in the
-order in which to search them.
+`--list` prints a JSON object, name -> {"label": for people, "axes": {setting: [values in order]}, "start":
+{setting: value}, "likelihood": "exact" or "rbm", "missing": null or the pip line of what is not installed}. Axes
+stand in the order in which to search them.
 
-Files are CSV or CSV.gz of 0 and 1 without a header. A fit sees the training rows; where it goes on step by step, the
-validation rows say when to stop, and the best step is kept. Settings that `--settings` leaves out are those of "start".
-`--out` gets {"valid": mean log-likelihood of a validation row in nats, "test": of a test row, "seconds": of the
-processor for the fit alone, "note": text}. For "rbm", whose partition function others estimate, it gets {"weights": path
-of an .npz with weight (n_hidden, n_visible), b, c, "seconds", "note"}. All work is that of one thread. Errors of a user
-are one line, with exit status 2.
+Files are CSV or CSV.gz of 0 and 1 without a header. A fit sees the training rows; where it goes on step by step,
+the validation rows say when to stop, and the best step is kept. Settings that `--settings` leaves out are those of
+"start". `--out` gets {"valid": mean log-likelihood of a validation row in nats, "test": of a test row, "seconds":
+of the processor for the fit alone, "note": text}. For "rbm", whose partition function others estimate, it gets
+{"weights": path of an .npz with weight (n_hidden, n_visible), b, c, "seconds", "note"}. All work is that of one
+thread. Errors of a user are one line, with exit status 2.
 """
 
 import argparse
@@ -214,7 +214,9 @@ def read_rows(file: Path) -> Any:
     except FileNotFoundError:
         refuse(f"{file}: no such file")
     except (OSError, ValueError) as error:
-        refuse(f"{file}: not a table of 0 and 1, separated by commas, without a header ({error})".replace("\n", " "))
+        refuse(
+            f"{file}: not a table of 0 and 1, separated by commas, without a header ({error})".replace("\n", " ")
+        )
     if rows.size == 0:
         refuse(f"{file}: no rows")
     if not ((rows == 0) | (rows == 1)).all():
@@ -222,7 +224,9 @@ def read_rows(file: Path) -> Any:
     return rows.astype(np.uint8)
 
 
-def fitted(peer: Peer, files: dict[str, Path], settings: dict[str, Setting], seed: int, out: Path) -> dict[str, Any]:
+def fitted(
+    peer: Peer, files: dict[str, Path], settings: dict[str, Setting], seed: int, out: Path
+) -> dict[str, Any]:
     """What `--out` gets; the weights of an RBM are written beside it."""
     import numpy as np
 

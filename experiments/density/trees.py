@@ -64,7 +64,7 @@ def chow_liu(train: Rows, valid: Rows, *, seed: int, pseudocount: float) -> Fitt
     parents = tree.parent[children]
     table = p[:, :, parents, children]  # of (parent, child)
     log_table = np.log(table / table.sum(1, keepdims=True))
-    log_root = np.log(np.stack([p[0, 0, root, root] + p[0, 1, root, root], p[1, 1, root, root] + p[1, 0, root, root]]))
+    log_root = np.log(p[:, :, root, root].sum(1))
 
     def log_likelihood(rows: Rows) -> Real:
         of_children = log_table[rows[:, parents], rows[:, children], np.arange(len(children))].sum(1)
