@@ -78,11 +78,11 @@ class LogLikelihood(EveryIterations):
     the training images. Its estimate of log Z tends to be too small, and the likelihood too large;
     ``log_z_standard_error`` and ``log_z_effective_sample_size`` (out of ``n_chains``) say how far to trust it.
 
-    Where chains persist from update to update (PCD, parallel tempering), reverse AIS begins at them, and the
-    larger log Z of both counts, which flatters no model. ``log_z_gap``, log Z by annealing less that from the
-    chains, is about 0 while the chains are samples of the model. Where they have stopped mixing they miss a part
-    of its states, and the gap grows, to ten nats and more: training then makes the likelihood worse. At two looks
-    in a row above ``MOST_BEHIND`` nats, or at the last one, a warning names the remedy.
+    Where the chains of an RBM's sampler persist from update to update (PCD, parallel tempering), reverse AIS
+    begins at them, too. ``log_z_gap``, log Z by annealing less that from the chains, is about 0 while the chains
+    are samples of the model. Chains that have stopped mixing sit in modes of little weight, and the gap grows, to
+    ten nats and more: training then makes the likelihood worse. At two looks in a row above ``MOST_BEHIND`` nats,
+    or at the last one, a warning names the remedy.
 
     Attributes:
         history: Every value so far, the oldest first; checkpoints keep it.
@@ -246,9 +246,7 @@ class LogLikelihood(EveryIterations):
             "log_z_standard_error": estimate.standard_error,
             "log_z_effective_sample_size": estimate.effective_sample_size,
         }
-        if down is not None:
-            values |= {"log_z": torch.maximum(estimate.log_z, down), "log_z_gap": estimate.log_z - down}
-        return values
+        return values if down is None else {**values, "log_z_gap": estimate.log_z - down}
 
     def _say_if_behind(self, trainer: pl.Trainer, module: pl.LightningModule, gap: Tensor | None) -> None:
         """Warn where the chains are no samples of the model any more, once a model."""
@@ -282,7 +280,9 @@ def behind(gap: float) -> str:
 def _chains_of(module: pl.LightningModule, outputs: object) -> Tensor | None:
     """Visible states of chains that go on from update to update; None without."""
     negative = outputs.get("negative") if isinstance(outputs, dict) else None
-    if negative is None or negative.weight is not None or negative.v.shape[-2] < 2 or not chains_persist(module):
+    if negative is None or negative.weight is not None or negative.v.shape[-2] < 2:
+        return None
+    if not hasattr(module, "sampler") or not chains_persist(module):
         return None
     v: Tensor = negative.v
     return v

@@ -27,6 +27,7 @@ CHOOSES = 1000
 
 _SET_BY_STUDY = {
     "pretrain.iterations": "Use density.start.updates and density.axes.updates.",
+    "pretrain.optimizer.lr": "Use density.start.rate and density.axes.rate.",
     "sampler": "Each of density.models has its own.",
     "seed": "Use density.replicas.",
 }
@@ -149,14 +150,16 @@ def _trial(
     choosing: bool,
 ) -> DensityTrial:
     model = density.models[name]
-    own = [_filled_in(one, setting, f"density.models.{name}") for one in (*density.overrides, *model.overrides)]
+    at = f"density.models.{name}"
+    common = (*(_filled_in(one, setting, "density.overrides") for one in density.overrides), *overrides)
+    own = [_filled_in(one, setting, f"{at}.overrides") for one in model.overrides]
     keys = ("data.path", "data.validation", "data.test")
-    data = [f"{key}={json.dumps(file)}" for key, file in zip(keys, files, strict=True)]
-    first = composed_for(overrides, (*own, *data, *_run_settings(1)))
+    own += [f"{key}={json.dumps(file)}" for key, file in zip(keys, files, strict=True)]
+    first = composed_for(common, (*own, *_run_settings(1)))
     plan = build(first)
     n_train, size = pretraining_of(plan)[0].data.n_train, first.pretrain.batch_size
     passes = max(1, round(setting["updates"] / math.ceil(n_train / min(size or n_train, n_train))))
-    composed = composed_for(overrides, (*own, *data, *_run_settings(passes)))
+    composed = composed_for(common, (*own, *_run_settings(passes)))
     settings: Any = OmegaConf.to_container(composed, resolve=False)
     return DensityTrial(
         method=name,
