@@ -1,7 +1,6 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
 import logging
-import math
 from typing import Any, ClassVar, Literal, TypedDict
 
 import lightning.pytorch as pl
@@ -32,7 +31,7 @@ QUICKLY_ENUMERATED = 16
 """Units that "auto" enumerates at most."""
 
 QUICKLY_ANNEALED = 10**10
-"""Products of a unit and a weight in all chains and steps of AIS that "auto" computes at most: about a second."""
+"""Products in all chains and steps of AIS that "auto" computes at most, see ``annealing_products``: a second."""
 
 
 MOST_BEHIND = 1.0
@@ -71,8 +70,8 @@ class LogLikelihood(EveryIterations):
     callback's own, the same draws each time; so are means of spins and of categories. Of real units it is the log
     of a density. Where values are missing it is that of the observed ones, of models with up to 16 hidden units;
     of larger ones there is none. In upper layers of a stack the "images" are mean activations, drawn likewise, and
-    the likelihood is that of the layer. For a Boltzmann machine with more than 16 hidden units the mean-field
-    bound takes the place of the likelihood.
+    the likelihood is that of the layer. For a Boltzmann machine with more than 16 hidden units that are coupled to
+    each other the mean-field bound takes the place of the likelihood.
 
     Annealed importance sampling (AIS; Salakhutdinov & Murray 2008) starts at independent units with the means of
     the training images. Its estimate of log Z tends to be too small, and the likelihood too large;
@@ -223,9 +222,8 @@ class LogLikelihood(EveryIterations):
             return self.method
         if model.n_enumerated <= min(QUICKLY_ENUMERATED, self.max_units):
             return "exact"
-        two_layers = len(model.classes) == 2
-        n_products = self.n_chains * self.n_betas * model.n_visible * model.n_hidden * math.prod(model.replicas)
-        return "ais" if two_layers and n_products <= QUICKLY_ANNEALED else None
+        n_products = likelihood.annealing_products(model, self.n_chains, self.n_betas)
+        return "ais" if n_products <= QUICKLY_ANNEALED else None
 
     def _partition_function(
         self, model: EnergyModel, method: str, train: Tensor | None, observed: Tensor | None, chains: Tensor | None

@@ -1,6 +1,6 @@
 """How likely data are under an energy model: log Z by enumeration or annealing, and what follows from it."""
 
-from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, base_of
+from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, annealing_products, base_of
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class, log_likelihood_bound
 from memcomp_lightning.likelihood.both_ways import BothWays, estimate_both_ways
 from memcomp_lightning.likelihood.exact import (
@@ -17,6 +17,7 @@ __all__ = [
     "AisEstimate",
     "BothWays",
     "ReverseAis",
+    "annealing_products",
     "base_of",
     "base_on_first_class",
     "estimate_both_ways",

@@ -1,5 +1,6 @@
 """Estimate log Z of models too large to be enumerated, by annealed importance sampling, from below and above."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,11 +12,15 @@ from tqdm.auto import tqdm
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
-from memcomp_lightning.models.base import EnergyModel, Visible, as_two_layers
+from memcomp_lightning.likelihood.machine_ais import MachinePath
+from memcomp_lightning.models.base import EnergyModel, Visible
 from memcomp_lightning.models.init import independent_bias
 from memcomp_lightning.models.rbm import RBM
 
 Schedule = Sequence[float] | Tensor
+
+STEP = 10**5
+"""Products in the time that one class of a machine takes to be drawn, however few units it has."""
 
 base_of = independent_bias
 """Visible bias of independent units with the data's means, a base for AIS: ``base_of(v, model.visible)``."""
@@ -79,7 +84,8 @@ class Ais(_Annealing):
     .. math:: p_\beta(v) \propto \mu(v) exp((1 - \beta) b_0.v + \beta b.v + \sum_i A(\beta (W v + c)_i))
 
     with the measure and the cumulant A of the units, log(1 + exp(f)) for those in {0, 1}. Real units keep their
-    precision along the way.
+    precision along the way. A Boltzmann machine of two classes of units is such an RBM; of any other one the path
+    is that of :class:`~memcomp_lightning.likelihood.machine_ais.MachinePath`.
 
     A chain starts at an independent draw at beta = 0 and makes k Gibbs sweeps at each beta in between. The mean
     weight is Z / Z_0 without bias; log Z is therefore too low on average, and log p(v) too high.
@@ -112,17 +118,22 @@ class Ais(_Annealing):
         """Estimate log Z.
 
         Args:
-            model: The RBM, or a Boltzmann machine of two classes of units (a DBM), on any device.
+            model: An RBM or a Boltzmann machine of any connectivity, on any device.
             generator: Random stream.
-            base: Visible bias b_0 of the RBM at beta = 0, ``(n_visible,)`` or ``(*replicas, n_visible)``, see
+            base: Visible bias b_0 at beta = 0, ``(n_visible,)`` or ``(*replicas, n_visible)``, see
                 :func:`base_of`; None is zeros.
             progress: Show a bar.
 
         Raises:
-            SettingError: base has the wrong shape; a machine has more than two classes.
+            SettingError: base has the wrong shape.
         """
-        base = _base(model, base)
-        rbm, base = as_two_layers(model).rbm, base_on_first_class(model, base)
+        base, two_layers = _base(model, base), model.two_layers()
+        if two_layers is None:
+            path = MachinePath(model, base)
+            x = path.start(self.n_chains, generator=generator)
+            log_w = path.anneal(x, self._schedule(), self.k, generator=generator, progress=progress)
+            return _summary(path.log_z_of_base(), log_w, 1)
+        rbm, base = two_layers.rbm, base_on_first_class(model, base)
         start = base.unsqueeze(-2).expand(*rbm.replicas, self.n_chains, rbm.n_visible)
         v = rbm.visible.sample(start, generator=generator)
         log_w = _anneal(rbm, v, base, self._schedule(), self.k, generator, progress)
@@ -140,13 +151,20 @@ class ReverseAis(_Annealing):
     """
 
     def estimate(
-        self, model: RBM, v: Visible, *, generator: Generator, base: Tensor | None = None, progress: bool = False
+        self,
+        model: EnergyModel,
+        v: Visible,
+        *,
+        generator: Generator,
+        base: Tensor | None = None,
+        progress: bool = False,
     ) -> AisEstimate:
         """Estimate log Z; ``log_weights`` are those of Z_0 / Z.
 
         Args:
-            model: The RBM.
-            v: Samples of the model, two or more a replica; each starts a chain.
+            model: As that of ``Ais.estimate``.
+            v: Samples of the model, two or more a replica; each starts a chain. Of an RBM the visible units, of a
+                machine all units, visible ones first: states of ``model.chains()``.
             generator: Random stream.
             base: As that of ``Ais.estimate``.
             progress: Show a bar.
@@ -154,12 +172,32 @@ class ReverseAis(_Annealing):
         Raises:
             SettingError: v or base has the wrong shape.
         """
-        fits = v.ndim >= 2 and v.shape[:-2] == model.replicas and v.shape[-1] == model.n_visible
-        allowed = f"{(*model.replicas, 'n', model.n_visible)} with n >= 2"
+        two_layers = model.two_layers()
+        is_rbm = two_layers is not None and two_layers.units is None
+        width = model.n_visible if is_rbm else model.n_units
+        fits = v.ndim >= 2 and v.shape[:-2] == model.replicas and v.shape[-1] == width
+        allowed = f"{(*model.replicas, 'n', width)} with n >= 2"
         require(fits and v.shape[-2] >= 2, "shape of v", tuple(v.shape), allowed)
-        base = _base(model, base)
-        log_w = _anneal(model, v.to(model.b), base, self._schedule()[::-1], self.k, generator, progress)
-        return _summary(_log_z_of_base(model, base), log_w, -1)
+        base, v, betas = _base(model, base), v.to(model.b), self._schedule()[::-1]
+        if two_layers is None:
+            path = MachinePath(model, base)
+            log_w = path.anneal(v, betas, self.k, generator=generator, progress=progress)
+            return _summary(path.log_z_of_base(), log_w, -1)
+        rbm, base = two_layers.rbm, base_on_first_class(model, base)
+        log_w = _anneal(rbm, two_layers.first(v), base, betas, self.k, generator, progress)
+        return _summary(_log_z_of_base(rbm, base), log_w, -1)
+
+
+def annealing_products(model: EnergyModel, n_chains: int, n_betas: int) -> float:
+    """Products of a unit and a weight in all chains and steps of AIS, about 10^10 a second and CPU thread.
+
+    Machines of many classes take most of their time for the classes one by one, which counts as products.
+    """
+    n_steps, n_replicas = n_chains * n_betas, math.prod(model.replicas)
+    pairs = model.quadratic_form().pairs
+    if pairs is None or len(model.classes) == 2:
+        return n_steps * model.n_visible * model.n_hidden * n_replicas
+    return 3 * n_steps * len(pairs) * n_replicas + STEP * n_betas * len(model.classes)
 
 
 @torch.no_grad()

@@ -30,7 +30,7 @@ def log_partition_function_by_classes(model: EnergyModel, max_units: int) -> Per
     """Log Z by enumerating all units outside the largest class."""
     model = double_of(model)
     largest, others, kind = model.outside_largest_class()
-    _require_few(kind, max_units)
+    _require_few(kind, max_units, "Estimate log Z (Ais).")
     rows = max(1, NUMBERS // (model.n_units * max(1, math.prod(model.replicas))))
     parts = []
     for numbers in torch.arange(kind.n_states, device=model.b.device).split(rows):
@@ -52,7 +52,7 @@ def log_hidden_sum(model: EnergyModel, v: Tensor, max_units: int) -> PerState:
     hidden = torch.arange(model.n_visible, model.n_units, device=v.device)
     others = _without(hidden, largest.units)
     kind = model.hidden.select(others - model.n_visible)
-    _require_few(kind, max_units)
+    _require_few(kind, max_units, "Use log_likelihood_bound.")
     states = all_states(kind, v)
 
     def of_images(some: Tensor) -> Tensor:
@@ -103,8 +103,7 @@ def _without(units: Tensor, some: Tensor) -> Tensor:
     return units[~torch.isin(units, some)]
 
 
-def _require_few(kind: Units, max_units: int) -> None:
+def _require_few(kind: Units, max_units: int, remedy: str) -> None:
     n_units = log2_states(kind)
     allowed = f"at most max_units = {max_units}, because all their states are enumerated"
-    remedy = "Use Ais if the machine has two classes of units; otherwise use a smaller machine."
     require_few_bits("units outside the largest class", n_units, max_units, allowed, remedy)

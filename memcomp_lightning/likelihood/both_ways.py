@@ -3,14 +3,15 @@
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.likelihood.ais import Ais, AisEstimate, ReverseAis, base_of
 from memcomp_lightning.likelihood.boltzmann import base_on_first_class
-from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, as_two_layers
+from memcomp_lightning.models.base import EnergyModel, Images, PerReplica
 from memcomp_lightning.models.chains import sweep
+from memcomp_lightning.models.rbm import RBM
 
 
 class BothWays(NamedTuple):
@@ -59,7 +60,7 @@ def estimate_both_ways(
     Both paths begin, or end, at independent units with the means of the rows.
 
     Args:
-        model: As for ``Ais.estimate``.
+        model: An RBM or a Boltzmann machine of any connectivity, a DBM or a semi-restricted machine, say.
         v: Training rows, values of the units, ``(*replicas, n, n_visible)`` or without replica axes. The first
             ``n_chains`` of them, again and again if there are fewer, start the chains down: shuffle sorted rows.
         n_chains: Chains of either way, >= 2.
@@ -69,20 +70,30 @@ def estimate_both_ways(
         seed: Of all draws.
 
     Raises:
-        SettingError: A setting out of range; a model that ``Ais`` cannot anneal.
+        SettingError: A setting out of range; rows of another shape.
     """
     require_count("n_sweeps", n_sweeps, minimum=0)
     base = base_of(v, model.visible)
     up = Ais(n_chains=n_chains, n_betas=n_betas).estimate(model, generator=rng.stream(seed, "ais"), base=base)
     rows = torch.arange(n_chains, device=v.device) % v.shape[-2]
     generator = rng.stream(seed, "fantasies")
-    layers, samples = as_two_layers(model), v[..., rows, :].to(model.b).expand(*model.replicas, -1, -1)
-    if layers.units is not None:
-        base = base_on_first_class(model, base)
-        hidden = model.hidden.values_of(model.hidden_mean(samples), generator=generator)
-        samples = layers.first(torch.cat((samples, hidden), dim=-1))
+    x = _chain_states(model, v[..., rows, :].to(model.b).expand(*model.replicas, -1, -1), generator)
+    reverse, of_reverse = ReverseAis(n_betas=n_betas), rng.stream(seed, "reverse ais")
+    layers = model.two_layers()
+    if layers is None:
+        chains = model.chains()
+        for _ in range(n_sweeps):
+            x = chains.sweep(x, generator=generator)
+        return BothWays(up, reverse.estimate(model, x, generator=of_reverse, base=base))
+    samples, base = layers.first(x), base_on_first_class(model, base)
     for _ in range(n_sweeps):
         samples = sweep(layers.rbm, samples, generator=generator)
-    reverse = ReverseAis(n_betas=n_betas)
-    down = reverse.estimate(layers.rbm, samples, generator=rng.stream(seed, "reverse ais"), base=base)
-    return BothWays(up, down)
+    return BothWays(up, reverse.estimate(layers.rbm, samples, generator=of_reverse, base=base))
+
+
+def _chain_states(model: EnergyModel, v: Tensor, generator: Generator) -> Tensor:
+    """States of the model's chains with these visible units: in an RBM they are all of it."""
+    if isinstance(model, RBM):
+        return v
+    hidden = model.hidden.values_of(model.hidden_mean(v), generator=generator)
+    return torch.cat((v, hidden), dim=-1)

@@ -35,25 +35,48 @@ class Block(NamedTuple):
     Attributes:
         units: Their indices, ``(n_class,)``.
         neighbours: Indices of the units coupled to any of them, ``(n_neighbours,)``.
-        weight: ``(*replicas, n_class, n_neighbours)``, zero where a pair is not coupled.
+        couplings: To the neighbours, ``(*replicas, n_class, n_neighbours)``; where these are most units, to all of
+            them, ``(*replicas, n_class, n_units)``. Zero where a pair is not coupled.
         bias: ``(*replicas, n_class)``.
         kind: What the units are.
-        of_all: The same couplings with a column for each unit of the model, ``(*replicas, n_class, n_units)``;
-            None where neighbours are few beside all others.
     """
 
     units: Tensor
     neighbours: Tensor
-    weight: Tensor
+    couplings: Tensor
     bias: Tensor
     kind: Units
-    of_all: Tensor | None = None
+
+    @property
+    def to_all(self) -> bool:
+        """Whether ``couplings`` has a column for each unit of the model."""
+        return self.couplings.shape[-1] > len(self.neighbours)
+
+    @property
+    def weight(self) -> Tensor:
+        """The couplings to the neighbours, ``(*replicas, n_class, n_neighbours)``."""
+        return self.couplings[..., self.neighbours] if self.to_all else self.couplings
 
     def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
         """Field of each unit given all others: the log odds of units in {0, 1}."""
-        if self.of_all is not None:
-            return affine(x, self.of_all, self.bias)  # to gather values would take longer than to multiply them
-        return affine(x[..., self.neighbours], self.weight, self.bias)
+        # To gather values of most units would take longer than to multiply them.
+        return affine(x if self.to_all else x[..., self.neighbours], self.couplings, self.bias)
+
+    def draw(self, x: Tensor, beta: float | Tensor, base: Tensor | None, *, generator: Generator) -> None:
+        """Draw the units in ``x``, given all others, at an inverse temperature and with a base, see :func:`annealed`."""
+        own = None if base is None else base[..., self.units]
+        x[..., self.units] = self.kind.sample(annealed(self.field(x), beta, own), generator=generator)
+
+
+def annealed(
+    field: Float[Tensor, "*replicas n n_some"], beta: float | Tensor, base: Float[Tensor, "*replicas n_some"] | None
+) -> Float[Tensor, "*replicas n n_some"]:
+    """Fields at inverse temperature ``beta``, a number or ``(..., n, 1)``, between those of the base and the model's.
+
+    It is ``beta * field + (1 - beta) * base``; no base is one of zeros.
+    """
+    field = beta * field
+    return field if base is None else field + (1 - beta) * base.unsqueeze(-2)
 
 
 class QuadraticForm(NamedTuple):
@@ -225,7 +248,7 @@ def as_two_layers(model: EnergyModel) -> TwoLayers:
     """
     layers = model.two_layers()
     allowed = "2, with couplings only between them, as in an RBM, a DBM or a grid"
-    remedy = "For other machines use log_partition_function, up to 32 units outside the largest class."
+    remedy = "For other machines use Ais or log_partition_function."
     require(layers is not None, "number of classes of units", len(model.classes), allowed, remedy)
     assert layers is not None
     return layers

@@ -10,6 +10,7 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
@@ -185,34 +186,43 @@ class BoltzmannMachine(Machine):
         return [layout.units for layout in self._layouts()]
 
     def _layouts(self) -> list[_Layout]:
+        buffers: dict[str, Any] = self._buffers  # many of them are asked for at each sweep
         return [
-            _Layout(**{name: getattr(self, f"_{name}{number}") for name in _INDICES}, n_forward=n_forward)
+            _Layout(*[buffers[f"_{name}{number}"] for name in _INDICES], n_forward)
             for number, n_forward in enumerate(self._n_forward)
         ]
 
     def blocks(self) -> list[Block]:
         """The classes, each with its couplings: what a sweep over all units needs."""
-        bias, found = self.bias, []
         layouts = self._layouts()
         kinds: Iterable[Any] = self._kinds or [
             _kind_of(self.visible, self.hidden, layout.units) for layout in layouts
         ]
-        matrix = self._matrix() if self._dense else None
-        for (units, neighbours, edge, slot, _), kind in zip(layouts, kinds, strict=True):
-            if matrix is not None:
-                of_all = matrix[..., units, :]
-                weight = of_all[..., neighbours]
-                found.append(Block(units, neighbours, weight, bias[..., units], kind, of_all))
-                continue
-            weight = self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
-            found.append(Block(units, neighbours, weight, bias[..., units], kind))
-        return found
+        sizes = [len(layout.units) for layout in layouts]
+        order = torch.cat([layout.units for layout in layouts])
+        biases = self.bias.index_select(-1, order).split(sizes, dim=-1)
+        couplings: Iterable[Tensor] = (
+            self._matrix().index_select(-2, order).split(sizes, dim=-2)
+            if self._dense
+            else [
+                self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
+                for units, neighbours, edge, slot, _ in layouts
+            ]
+        )
+        parts = zip(layouts, couplings, biases, kinds, strict=True)
+        return [
+            Block(layout.units, layout.neighbours, weight, bias, kind) for layout, weight, bias, kind in parts
+        ]
 
     def _matrix(self) -> Tensor:
         """The couplings of all units to all units, ``(*replicas, n_units, n_units)``."""
-        first, second = self.pairs.unbind(-1)
-        upper = self._placed((self.n_units, self.n_units), first * self.n_units + second, self.coupling)
+        upper = self._upper()
         return upper + upper.mT
+
+    def _upper(self) -> Tensor:
+        """The same with each pair once."""
+        first, second = self.pairs.unbind(-1)
+        return self._placed((self.n_units, self.n_units), first * self.n_units + second, self.coupling)
 
     def _placed(self, shape: tuple[int, int], at: Tensor, coupling: Tensor) -> Tensor:
         """Couplings at these places of a flat matrix of zeros, as a matrix."""
@@ -276,6 +286,8 @@ class BoltzmannMachine(Machine):
     def tempered_energy(self, v: Visible, h: Hidden) -> PerState:
         """E(v, h) without the measures of the units."""
         x = torch.cat((v, h), dim=-1)
+        if self._dense:
+            return -(affine(x, self._upper(), self.bias) * x).sum(-1)
         coupled = sum(
             ((block.field(x) - block.bias.unsqueeze(-2)) * x[..., block.units]).sum(-1) for block in self.blocks()
         )

@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.models.base import EnergyModel, Readout
+from memcomp_lightning.models.one_by_one import in_runs
 from memcomp_lightning.models.units import Units, side_by_side
 from memcomp_lightning.types import Configurations
 
@@ -81,6 +82,7 @@ class ClassChains:
     def __init__(self, model: EnergyModel) -> None:
         self._model = model
         self._blocks = model.blocks()
+        self._runs = in_runs(self._blocks)
 
     def random(self, n: int, *, generator: Generator) -> Tensor:
         """Draw all units."""
@@ -91,8 +93,8 @@ class ClassChains:
     def sweep(self, x: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> Tensor:
         """Draw each class given all others."""
         x = x.clone()
-        for block in self._blocks:
-            x[..., block.units] = block.kind.sample(beta * block.field(x), generator=generator)
+        for run in self._runs:
+            run.draw(x, beta, None, generator=generator)
         return x
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:

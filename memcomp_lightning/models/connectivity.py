@@ -41,6 +41,20 @@ def layered(sizes: Sequence[int]) -> Pairs:
     return torch.cat([torch.cartesian_prod(lower, upper) for lower, upper in pairwise(layers)] or [_NONE])
 
 
+def semi_restricted(n_visible: int, n_hidden: int) -> Pairs:
+    """Every pair of visible units, every visible unit with every hidden one, and no hidden pair.
+
+    (Osindero & Hinton 2007: a semi-restricted Boltzmann machine.)
+
+    >>> semi_restricted(2, 2).tolist()
+    [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3]]
+    """
+    require_count("n_visible", n_visible)
+    require_count("n_hidden", n_hidden, minimum=0)
+    pairs = full(n_visible + n_hidden)
+    return pairs[pairs[:, 0] < n_visible]
+
+
 def grid(n_rows: int, n_columns: int) -> Pairs:
     """Neighbours in a rectangle, units row by row.
 

@@ -109,8 +109,6 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
     for block in model.blocks():
         keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
         if len(keep):
-            weight, bias = block.weight.index_select(-2, keep), block.bias.index_select(-1, keep)
-            of_all = None if block.of_all is None else block.of_all.index_select(-2, keep)
-            kind = block.kind.select(keep)
-            found.append(Block(block.units[keep], block.neighbours, weight, bias, kind, of_all))
+            couplings, bias = block.couplings.index_select(-2, keep), block.bias.index_select(-1, keep)
+            found.append(Block(block.units[keep], block.neighbours, couplings, bias, block.kind.select(keep)))
     return found

@@ -39,6 +39,12 @@ def visible_units_coupled(model: EnergyModel) -> bool:
     return pairs is not None and bool((pairs < model.n_visible).all(-1).any())
 
 
+def hidden_units_coupled(model: EnergyModel) -> bool:
+    """Whether hidden units are coupled to each other: if none are, they are summed in closed form."""
+    pairs = model.quadratic_form().pairs
+    return pairs is not None and bool((pairs >= model.n_visible).all(-1).any())
+
+
 def visible_field(model: EnergyModel, h: Hidden) -> Visible:
     """Fields of the visible units given the hidden ones.
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError, UserError, require_count
-from memcomp_lightning.likelihood import Ais, AisEstimate, ReverseAis, log_partition_function
+from memcomp_lightning.likelihood import Ais, AisEstimate, ReverseAis, annealing_products, log_partition_function
 from memcomp_lightning.likelihood.bits import in_bits
-from memcomp_lightning.models import RBM, EnergyModel
+from memcomp_lightning.models import EnergyModel
 
 MOST_BITS, MOST_OTHERS = 25, 20
 """Units of the smaller layer that are enumerated: of bits and spins a second, of other kinds a few."""
@@ -20,6 +20,9 @@ LEAST_EFFECTIVE = 1 / 3
 
 FACTOR = 4
 """How many times more steps AIS takes where too few chains are effective."""
+
+MOST_PRODUCTS = 3 * 10**11
+"""Of one annealing of a machine of more than two classes: about half a minute."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,7 +52,7 @@ class LogZ(NamedTuple):
         value: In nats.
         error: Standard error, 0 where it is exact.
         ais: The estimate; None where the states were enumerated.
-        reverse: AIS the other way round, from chains of the model; None of machines that are no RBM.
+        reverse: AIS the other way round, from chains of the model; None where the states were enumerated.
         n_betas: Steps that AIS took; 0 where the states were enumerated.
     """
 
@@ -93,32 +96,32 @@ def log_z_of(model: EnergyModel, *, annealing: Annealing | None = None, seed: in
     that are scored. Those chains are also where reverse AIS begins, a check that both find the same.
 
     Raises:
-        UserError: A machine of more than two classes of units that is too large to enumerate.
+        UserError: A machine of more than two classes of units that is too large to enumerate and to anneal.
     """
     two_layers = model.two_layers()
     binary = two_layers is not None and in_bits(two_layers.rbm) is not None
     most = MOST_BITS if binary else MOST_OTHERS
     if _few(model, most):
         return LogZ(float(log_partition_function(model, max_units=most)), 0.0)
-    if two_layers is None:
+    settings = annealing or Annealing()
+    if not _quick(model, settings.n_chains, settings.n_betas):
         raise UserError(
             f"log Z of a {type(model).__name__} of {len(model.classes)} classes of units, more than {most} of "
-            "them outside the largest class, can be neither enumerated nor annealed"
+            "them outside the largest class, would take minutes to anneal: memcomp_lightning.likelihood.Ais can"
         )
-    settings = annealing or Annealing()
-    v = _samples(model, settings.n_chains, seed)
+    x = _samples(model, settings.n_chains, seed)
+    v = x[..., : model.n_visible]
     base, n_betas = model.visible.bias_of(v.sum(-2), len(v)), settings.n_betas
     while True:
         ais = Ais(n_chains=settings.n_chains, n_betas=n_betas)
         found = ais.estimate(model, generator=rng.stream(seed, "ais"), base=base)
         enough = float(found.effective_sample_size) >= LEAST_EFFECTIVE * settings.n_chains
-        if enough or n_betas * FACTOR > settings.most_betas:
+        more = n_betas * FACTOR
+        if enough or more > settings.most_betas or not _quick(model, settings.n_chains, more):
             break
-        n_betas *= FACTOR
-    reverse = None
-    if isinstance(model, RBM):
-        back = ReverseAis(n_betas=n_betas)
-        reverse = back.estimate(model, v, generator=rng.stream(seed, "reverse ais"), base=base)
+        n_betas = more
+    back = ReverseAis(n_betas=n_betas)
+    reverse = back.estimate(model, x, generator=rng.stream(seed, "reverse ais"), base=base)
     return LogZ(float(found.log_z), float(found.standard_error), found, reverse, n_betas)
 
 
@@ -129,10 +132,15 @@ def _few(model: EnergyModel, most: int) -> bool:
         return False
 
 
+def _quick(model: EnergyModel, n_chains: int, n_betas: int) -> bool:
+    """Whether a machine may be annealed in so many steps; those of two classes always."""
+    return len(model.classes) == 2 or annealing_products(model, n_chains, n_betas) <= MOST_PRODUCTS
+
+
 def _samples(model: EnergyModel, n: int, seed: int, n_sweeps: int = 1000) -> Tensor:
-    """Visible units of chains that began at random."""
+    """States of chains that began at random."""
     chains, generator = model.chains(), rng.stream(seed, "chains")
     x = chains.random(n, generator=generator)
     for _ in range(n_sweeps):
         x = chains.sweep(x, generator=generator)
-    return x[..., : model.n_visible]
+    return x

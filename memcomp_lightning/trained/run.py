@@ -7,6 +7,7 @@ from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any, NamedTuple, cast
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
@@ -215,7 +216,12 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     pairs, edges = next(iter(states.values())).get("pairs"), config.model.get("connectivity")
     if isinstance(pairs, Tensor) and isinstance(edges, DictConfig):
         # Its file may be elsewhere, and pictures are not known here. It joins sites, pairs are of their entries.
-        config.model.connectivity = _units_of(config, schema).site_of()[pairs].unique(dim=0).tolist()
+        visible = _units_of(config, schema)
+        hidden = torch.arange(max(0, int(pairs.max()) + 1 - visible.n), device="cpu")  # of one entry each
+        sites = torch.cat((visible.site_of(), visible.n_sites + hidden))
+        config.model.connectivity = sites[pairs].unique(dim=0).tolist()
+        if config.model.n_hidden is None:
+            config.model.n_hidden = len(hidden)
     network, classifier = _network(config, schema), None
     if "pretrain" in states:
         _take(network, states["pretrain"], files["pretrain"], replica)
