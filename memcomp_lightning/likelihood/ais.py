@@ -230,6 +230,7 @@ def _summary(log_z_of_base: Tensor, log_w: Tensor, sign: int) -> AisEstimate:
     return AisEstimate(log_z_of_base + sign * log_mean, error, w.sum(-1).square() / w.square().sum(-1), log_w)
 
 
+@torch.no_grad()
 def _log_z_of_base(model: RBM, base: Tensor) -> Tensor:
     """Log of Z_0 = prod_i exp(A(0)) prod_j exp(A(b_0j)), ``(*replicas,)`` float64."""
     free = model.c.new_zeros(*model.replicas, 1, model.n_hidden, dtype=torch.float64)

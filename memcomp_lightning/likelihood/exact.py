@@ -165,7 +165,7 @@ def _log_sum_of_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> Ten
 
 
 def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
-    """:func:`log_likelihood`, or :func:`log_likelihood_bound` where over 16 hidden units are coupled to each other."""
+    """:func:`log_likelihood`, or :func:`log_likelihood_bound` of over 16 hidden units coupled to each other."""
     if model.n_hidden > MOST_HIDDEN and hidden_units_coupled(model):
         return log_likelihood_bound(model, v, log_z)
     return log_likelihood(model, v, log_z)

@@ -26,6 +26,7 @@ class MachinePath:
         base: Visible bias b_0, ``(*replicas, n_visible)``.
     """
 
+    @torch.no_grad()
     def __init__(self, model: EnergyModel, base: Tensor) -> None:
         self._model, self._units = model, side_by_side(model.visible, model.hidden)
         self._base = torch.cat((base, base.new_zeros(*base.shape[:-1], model.n_hidden)), dim=-1)
@@ -38,6 +39,7 @@ class MachinePath:
         field = self._base.unsqueeze(-2).expand(*self._base.shape[:-1], n, -1)
         return self._units.sample(field, generator=generator)
 
+    @torch.no_grad()
     def log_z_of_base(self) -> PerReplica:
         """Log Z at beta = 0, in float64."""
         return self._units.cumulant(self._base.double().unsqueeze(-2)).sum((-2, -1))
@@ -63,7 +65,5 @@ class MachinePath:
         y = x.index_fill(-1, summed.units, 0.0)
         slope = -self._model.tempered_energy(y[..., :n], y[..., n:]) - (y * self._base.unsqueeze(-2)).sum(-1)
         field, base = summed.field(x).double(), self._base[..., summed.units].double()
-        before, after = (
-            summed.kind.cumulant(annealed(field, at, base)).sum(-1) for at in (beta, target)
-        )
+        before, after = (summed.kind.cumulant(annealed(field, at, base)).sum(-1) for at in (beta, target))
         return (target - beta) * slope.double() + after - before

@@ -63,17 +63,19 @@ class Block(NamedTuple):
         return affine(x if self.to_all else x[..., self.neighbours], self.couplings, self.bias)
 
     def draw(self, x: Tensor, beta: float | Tensor, base: Tensor | None, *, generator: Generator) -> None:
-        """Draw the units in ``x``, given all others, at an inverse temperature and with a base, see :func:`annealed`."""
+        """Draw the units in ``x``, given all others, with the fields of :func:`annealed`."""
         own = None if base is None else base[..., self.units]
         x[..., self.units] = self.kind.sample(annealed(self.field(x), beta, own), generator=generator)
 
 
 def annealed(
-    field: Float[Tensor, "*replicas n n_some"], beta: float | Tensor, base: Float[Tensor, "*replicas n_some"] | None
+    field: Float[Tensor, "*replicas n n_some"],
+    beta: float | Tensor,
+    base: Float[Tensor, "*replicas n_some"] | None,
 ) -> Float[Tensor, "*replicas n n_some"]:
-    """Fields at inverse temperature ``beta``, a number or ``(..., n, 1)``, between those of the base and the model's.
+    """Return ``beta * field + (1 - beta) * base``, the fields between those of independent units and of a model.
 
-    It is ``beta * field + (1 - beta) * base``; no base is one of zeros.
+    The inverse temperature ``beta`` is a number or ``(..., n, 1)``; no base is one of zeros.
     """
     field = beta * field
     return field if base is None else field + (1 - beta) * base.unsqueeze(-2)

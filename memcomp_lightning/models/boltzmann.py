@@ -188,7 +188,7 @@ class BoltzmannMachine(Machine):
     def _layouts(self) -> list[_Layout]:
         buffers: dict[str, Any] = self._buffers  # many of them are asked for at each sweep
         return [
-            _Layout(*[buffers[f"_{name}{number}"] for name in _INDICES], n_forward)
+            _Layout._make([*(buffers[f"_{name}{number}"] for name in _INDICES), n_forward])
             for number, n_forward in enumerate(self._n_forward)
         ]
 
@@ -210,9 +210,7 @@ class BoltzmannMachine(Machine):
             ]
         )
         parts = zip(layouts, couplings, biases, kinds, strict=True)
-        return [
-            Block(layout.units, layout.neighbours, weight, bias, kind) for layout, weight, bias, kind in parts
-        ]
+        return [Block(layout.units, layout.neighbours, weight, bias, kind) for layout, weight, bias, kind in parts]
 
     def _matrix(self) -> Tensor:
         """The couplings of all units to all units, ``(*replicas, n_units, n_units)``."""

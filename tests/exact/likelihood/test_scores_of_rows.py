@@ -16,11 +16,11 @@ from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.errors import SettingError, UserError
-from memcomp_lightning.likelihood import log_partition_function
+from memcomp_lightning.likelihood import annealing_products, log_partition_function
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.models.observed import visible_units_coupled
 from memcomp_lightning.models.units import Bernoulli, Spin
-from memcomp_lightning.testing import brute_force, small_machines, small_rbm
+from memcomp_lightning.testing import brute_force, small_machine, small_machines, small_rbm
 from memcomp_lightning.trained import Run, partition
 from memcomp_lightning.trained.partition import Annealing, log_z_of
 from memcomp_lightning.trained.scoring import score
@@ -129,6 +129,26 @@ def test_steps_grow_until_enough_chains_are_effective(monkeypatch: pytest.Monkey
     better = log_z_of(model, annealing=Annealing(n_betas=1, most_betas=256))
     assert better.n_betas in (16, 64, 256)
     assert abs(better.value - float(log_partition_function(model))) < 4 * better.error
+
+
+def test_machines_of_any_connectivity_are_annealed_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partition, "MOST_BITS", 0)
+    monkeypatch.setattr(partition, "MOST_OTHERS", 0)
+    model = small_machine(visible=Spin(6), hidden=Bernoulli(4))
+    with torch.no_grad():
+        model.coupling.mul_(3)
+    settings = Annealing(n_betas=1, most_betas=256)
+    found = log_z_of(model, annealing=settings)
+    assert found.n_betas > 1
+    assert found.trusted
+    assert "from the other side" in str(found)
+    assert abs(found.value - float(log_partition_function(model))) < 4 * found.error
+    n_products = annealing_products(model, settings.n_chains, found.n_betas)
+    monkeypatch.setattr(partition, "MOST_PRODUCTS", n_products - 1)
+    assert log_z_of(model, annealing=settings).n_betas == found.n_betas // 4
+    monkeypatch.setattr(partition, "MOST_PRODUCTS", 1)
+    with pytest.raises(UserError, match="would take minutes to anneal"):
+        log_z_of(model, annealing=settings)
 
 
 @pytest.mark.parametrize("make", small_machines().values(), ids=small_machines())

@@ -51,7 +51,10 @@ def test_fields_are_sums_over_the_pairs(kind, replicas):
         expected[..., j] += coupling * x[..., i]
     for block in machine.blocks():
         torch.testing.assert_close(block.field(x), expected[..., block.units])
-        torch.testing.assert_close(block._replace(of_all=None).field(x), expected[..., block.units])
+        assert block.to_all
+        alone = block._replace(couplings=block.weight)
+        assert not alone.to_all
+        torch.testing.assert_close(alone.field(x), expected[..., block.units])
 
 
 @pytest.mark.parametrize("replicas", [(), (2,)])
@@ -84,4 +87,4 @@ def ring():
 def test_few_pairs_stand_in_no_matrix():
     machine = machine_of("bits", (), ring())
     assert not machine._dense
-    assert all(block.of_all is None for block in machine.blocks())
+    assert not any(block.to_all for block in machine.blocks())
