@@ -50,7 +50,7 @@ class Block(NamedTuple):
     @property
     def to_all(self) -> bool:
         """Whether ``couplings`` has a column for each unit of the model."""
-        return self.couplings.shape[-1] > len(self.neighbours)
+        return self.couplings.shape[-1] > self.neighbours.shape[0]
 
     @property
     def weight(self) -> Tensor:

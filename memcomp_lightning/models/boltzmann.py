@@ -198,7 +198,7 @@ class BoltzmannMachine(Machine):
         kinds: Iterable[Any] = self._kinds or [
             _kind_of(self.visible, self.hidden, layout.units) for layout in layouts
         ]
-        sizes = [len(layout.units) for layout in layouts]
+        sizes = [layout.units.shape[0] for layout in layouts]
         order = torch.cat([layout.units for layout in layouts])
         biases = self.bias.index_select(-1, order).split(sizes, dim=-1)
         couplings: Iterable[Tensor] = (

@@ -1,5 +1,6 @@
 """Mean-field inference of units that are coupled to each other, with others clamped."""
 
+from itertools import islice
 from typing import Literal, NamedTuple
 
 import torch
@@ -106,9 +107,14 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
     found: list[Block] = []
     if not (model.n_hidden if clamped == "visible" else model.n_visible):
         return found
-    for block in model.blocks():
-        keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
-        if len(keep):
+    blocks = model.blocks()
+    units = torch.cat([block.units for block in blocks])
+    # One look at the device for all classes, of which a machine may have hundreds.
+    is_free = iter(_among(units, model.n_visible, clamped).tolist())
+    for block in blocks:
+        places = [place for place, free in enumerate(islice(is_free, block.kind.n)) if free]
+        if places:
+            keep = torch.tensor(places, device=units.device)
             couplings, bias = block.couplings.index_select(-2, keep), block.bias.index_select(-1, keep)
             found.append(Block(block.units[keep], block.neighbours, couplings, bias, block.kind.select(keep)))
     return found

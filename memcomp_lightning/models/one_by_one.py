@@ -8,6 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.ambient import in_own_dtypes
 from memcomp_lightning.models.base import Block
 from memcomp_lightning.models.units import Bernoulli, Spin
 
@@ -37,6 +38,7 @@ class OneByOne(NamedTuple):
     width: Tensor
 
     @torch.no_grad()
+    @in_own_dtypes
     def draw(self, x: Tensor, beta: float | Tensor, base: Tensor | None, *, generator: Generator) -> None:
         """Draw the units in ``x``, see ``Block.draw``."""
         n_chains, replicas, n = x.shape[-2], x.shape[:-2], len(self.units)
@@ -68,7 +70,7 @@ def in_runs(blocks: Sequence[Block]) -> list[Block | OneByOne]:
 
 
 def _alone(block: Block) -> bool:
-    return block.to_all and len(block.units) == 1 and type(block.kind) in (Bernoulli, Spin)
+    return block.kind.n == 1 and block.to_all and type(block.kind) in (Bernoulli, Spin)
 
 
 def _run(blocks: Sequence[Block]) -> OneByOne:

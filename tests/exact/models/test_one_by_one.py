@@ -97,3 +97,11 @@ def test_energies_of_a_dense_machine_are_those_of_its_pairs():
     pairs = (x[..., first] * x[..., second] * model.coupling.unsqueeze(-2)).sum(-1)
     expected = -pairs - (x * torch.cat((model.b, model.c), dim=-1).unsqueeze(-2)).sum(-1)
     torch.testing.assert_close(model.tempered_energy(x[..., :5], x[..., 5:]), expected)
+
+
+def test_autocast_changes_no_draw():
+    model = drawn(Bernoulli(9), Bernoulli(5), semi_restricted(9, 5), (2,)).float()
+    x, chains = model.chains().random(200, generator=rng.stream(1, "start")), model.chains()
+    plain = chains.sweep(x, generator=rng.stream(3, "sweep"))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert chains.sweep(x, generator=rng.stream(3, "sweep")).equal(plain)
