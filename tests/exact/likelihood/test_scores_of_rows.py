@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,7 @@ def test_steps_grow_until_enough_chains_are_effective(monkeypatch: pytest.Monkey
 def test_machines_of_any_connectivity_are_annealed_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(partition, "MOST_BITS", 0)
     monkeypatch.setattr(partition, "MOST_OTHERS", 0)
+    monkeypatch.setattr(partition, "_samples", partial(partition._samples, n_sweeps=100))
     model = small_machine(visible=Spin(6), hidden=Bernoulli(4))
     with torch.no_grad():
         model.coupling.mul_(3)
