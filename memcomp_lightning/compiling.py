@@ -30,7 +30,7 @@ def n_threads() -> int:
     return int(given) if given.isdecimal() and int(given) else int(getattr(config, "NUMBA_NUM_THREADS", 1))
 
 
-_PARTS = {"likelihood": "the likelihood's kernel"}
+_PARTS = {"likelihood": "the likelihood's kernel", "twister": "the draws"}
 
 
 @cache

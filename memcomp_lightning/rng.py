@@ -5,7 +5,8 @@ are torch's for models, and numpy's for problems from files, which are solved wi
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,15 @@ if TYPE_CHECKING:
 
     Generator = torch.Generator | np.random.Generator
     """A source of random numbers of either library."""
+
+
+_MANY = 2**12
+"""From so many numbers on a call of compiled code is quicker than torch's own draw."""
+
+_PAYS_AFTER = 2**25
+"""Numbers drawn by large calls until compiled code is loaded: a short run would lose half a second to it."""
+
+_drawn = [0]
 
 
 def stream(seed: int, name: str, index: int = 0, device: "torch.device | str" = "cpu") -> "torch.Generator":
@@ -85,8 +95,30 @@ def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None 
         wanted = torch.empty(0, dtype=torch.float64 if like.dtype == np.float64 else torch.float32)
         return alike(uniform(shape, generator=generator, like=wanted), like)
     dtype = like.dtype if like is not None and like.is_floating_point() else torch.float32
-    draw = torch.empty(tuple(shape), device=generator.device, dtype=dtype).uniform_(generator=generator)
+    draw = torch.empty(tuple(shape), device=generator.device, dtype=dtype)
+    compiled = _compiled_for(draw)
+    draw = draw.uniform_(generator=generator) if compiled is None else compiled(draw, generator)
     return draw if like is None else draw.to(like.device)
+
+
+def _compiled_for(draw: "Tensor") -> "Callable[[Tensor, torch.Generator], Tensor] | None":
+    """Compiled code that draws the same numbers, where it is quicker; else None."""
+    import torch
+
+    n = draw.numel()
+    if n < _MANY or draw.dtype != torch.float32 or draw.device.type != "cpu":
+        return None
+    _drawn[0] += n
+    return _twister() if _drawn[0] >= _PAYS_AFTER else None
+
+
+@cache
+def _twister() -> "Callable[[Tensor, torch.Generator], Tensor] | None":
+    try:
+        from memcomp_lightning import twister
+    except (ImportError, RuntimeError):  # the second: no folder to keep compiled code in
+        return None
+    return twister.fill if twister.agrees() else None
 
 
 def bernoulli(probability: Array, *, generator: "Generator") -> Array:
