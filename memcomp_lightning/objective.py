@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.types import Configurations, Weighted
 
 
 class Offsets(NamedTuple):
@@ -96,6 +96,33 @@ def contrast(
     if offsets is None:
         return model.total_energy(v, h, weight)
     return cast(HasCentredEnergy, model).centred_total_energy(v, h, weight, *offsets)
+
+
+def add_gradient(
+    model: HasTotalEnergy,
+    positive: Configurations,
+    negative: Configurations,
+    offsets: Offsets | None = None,
+    *,
+    share: float = 1.0,
+    valued: bool = True,
+) -> Float[Tensor, "*replicas"] | None:
+    """Add to the gradients of the parameters those of ``share`` times :func:`contrast`; return the contrast.
+
+    A model that has its gradient in closed form, by a method of this name as the package's own, makes no graph.
+    With ``valued=False`` nobody looks at the contrast, and None may be returned.
+    """
+    own = getattr(model, "add_gradient", None)
+    if own is None:
+        gap = contrast(model, positive, negative, offsets)
+        (share * gap.sum()).backward()
+        return gap.detach()
+    parts = [
+        Weighted(positive.v, positive.h, share * shares(positive)),
+        Weighted(negative.v, negative.h, -share * shares(negative)),
+    ]
+    gap = own(parts, offsets, valued=valued)
+    return None if gap is None else gap / share
 
 
 def shares(configurations: Configurations) -> Tensor:

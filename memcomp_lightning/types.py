@@ -28,6 +28,14 @@ class Configurations(NamedTuple):
     weight: Tensor | None = None
 
 
+class Weighted(NamedTuple):
+    """Configurations in a sum: v ``(*replicas, n, n_visible)``, h, and a weight of any sign ``(*replicas, n)``."""
+
+    v: Tensor
+    h: Tensor
+    weight: Tensor
+
+
 class NegativePhase(NamedTuple, Generic[StateT]):
     """What a sampler returns for one update.
 

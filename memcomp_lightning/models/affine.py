@@ -1,4 +1,4 @@
-"""The affine map of a layer on the replica axis."""
+"""Products of matrices on the replica axis: the affine map of a layer, and sums over configurations."""
 
 import torch
 import torch.nn.functional as F
@@ -20,3 +20,16 @@ def affine(
     if weight.ndim == 3 and x.ndim == 3:
         return torch.baddbmm(bias.unsqueeze(-2), x, weight.mT)
     return x @ weight.mT + bias.unsqueeze(-2)
+
+
+def plus_product(
+    total: Float[Tensor, "*replicas n m"] | None,
+    x: Float[Tensor, "*replicas n k"],
+    y: Float[Tensor, "*replicas k m"],
+) -> Float[Tensor, "*replicas n m"]:
+    """Add ``x y`` to a total, in its place and in one kernel where torch has one; None begins one."""
+    if total is None:
+        return x @ y
+    if total.ndim == 2:
+        return total.addmm_(x, y)
+    return total.baddbmm_(x, y) if total.ndim == 3 else total.add_(x @ y)

@@ -10,7 +10,7 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.errors import require, require_count
-from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.affine import affine, plus_product
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
 from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
@@ -20,7 +20,7 @@ from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Bernoulli, Mixed, Units, all_states, side_by_side
 from memcomp_lightning.rng import stream
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.types import Configurations, Weighted
 
 
 class _Layout(NamedTuple):
@@ -291,16 +291,11 @@ class BoltzmannMachine(Machine):
         )
         return -0.5 * coupled - (x * self.bias.unsqueeze(-2)).sum(-1)
 
-    def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        x = torch.cat((v, h), dim=-1)
-        return self._sums(x, x * weight.unsqueeze(-1))
-
-    def _centred_moments(
-        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    def _own_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
     ) -> tuple[Tensor, Tensor]:
+        of_pairs, of_units = centred
         offset = torch.cat((visible_offset, hidden_offset), dim=-1)
-        x = torch.cat((v, h), dim=-1) - offset.unsqueeze(-2)
-        of_pairs, of_units = self._sums(x, x * weight.unsqueeze(-1))
         first, second = self.pairs[:, 0], self.pairs[:, 1]
         of_units = of_units.index_add(-1, first, of_pairs * offset[..., second], alpha=-1)
         return of_pairs, of_units.index_add(-1, second, of_pairs * offset[..., first], alpha=-1)
@@ -316,18 +311,35 @@ class BoltzmannMachine(Machine):
         across = offset[..., first] * of_units[..., second] + offset[..., second] * of_units[..., first]
         return of_pairs + across, of_units
 
-    def _sums(self, x: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor]:
-        """Sums over configurations of the product of each pair and of each unit."""
+    def _moments(self, parts: Sequence[Weighted]) -> tuple[Tensor, Tensor]:
+        joint = [torch.cat((v, h), dim=-1) for v, h, _ in parts]
+        weighted = [x * weight.unsqueeze(-1) for x, (_, _, weight) in zip(joint, parts, strict=True)]
+        of_units = sum(some.sum(-2) for some in weighted)
+        assert isinstance(of_units, Tensor)
         if self._dense:
-            products = (x.mT @ weighted).flatten(-2)
             at = self.pairs[:, 0] * self.n_units + self.pairs[:, 1]
-            return products[..., at], weighted.sum(-2)
+            return self._products(joint, weighted, slice(None), slice(None))[..., at], of_units
         of_pairs = torch.empty_like(self.coupling)
         for units, neighbours, edge, slot, n in self._layouts():
             if n:
-                products = (x[..., units].mT @ weighted[..., neighbours]).flatten(-2)
+                products = self._products(joint, weighted, units, neighbours)
                 of_pairs.index_copy_(-1, edge[:n], products[..., slot[:n]])
-        return of_pairs, weighted.sum(-2)
+        return of_pairs, of_units
+
+    def _products(
+        self, joint: Sequence[Tensor], weighted: Sequence[Tensor], rows: Tensor | slice, columns: Tensor | slice
+    ) -> Tensor:
+        """Sums over configurations of the product of each two units, as a flat matrix."""
+        total = None
+        for x, y in zip(joint, weighted, strict=True):
+            total = plus_product(total, x[..., rows].mT, y[..., columns])
+        assert total is not None
+        return total.flatten(-2)
+
+    def _by_parameter(self, moments: Sequence[Tensor]) -> list[tuple[nn.Parameter, Tensor]]:
+        of_pairs, of_units = moments
+        of_b, of_c = of_units.split([self.n_visible, self.n_hidden], dim=-1)
+        return [(self.coupling, of_pairs), (self.b, of_b.contiguous()), (self.c, of_c.contiguous())]
 
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
         of_pairs, of_units = moments

@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.linalg import vecdot
 
-from memcomp_lightning.ambient import in_own_dtypes
+from memcomp_lightning.ambient import in_own_dtypes, with_gradient
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import EnergyModel, Hidden, PerReplica, PerState, Visible
 from memcomp_lightning.models.bit_form import BitForm, bit_form
 from memcomp_lightning.models.units import Bernoulli, Mixed, Units
 from memcomp_lightning.objective import shares
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.types import Configurations, Weighted
 
 
 class Machine(nn.Module):
@@ -90,9 +90,10 @@ class Machine(nn.Module):
     @in_own_dtypes
     def total_energy(self, v: Visible, h: Hidden, weight: PerState) -> PerReplica:
         """Weighted sum of E over configurations, constants to autograd; the weights may have any sign."""
+        parts = [Weighted(v, h, weight)]
         with torch.no_grad():
-            moments = self._moments(v, h, weight)
-        return self._energy_of(moments) + self._of_measures(v, h, weight)
+            moments = self._moments(parts)
+        return self._energy_of(moments) + self._of_measures(parts)
 
     @in_own_dtypes
     def centred_total_energy(
@@ -109,47 +110,98 @@ class Machine(nn.Module):
         :math:`\gamma (v - \mu)^2 / 2 - b' (v - \mu)` a step of :math:`\gamma` moves
         :math:`b = b' + \gamma \mu` with it.
         """
+        parts, offsets = [Weighted(v, h, weight)], (visible_offset, hidden_offset)
         with torch.no_grad():
-            moments = self._centred_moments(v, h, weight, visible_offset, hidden_offset)
-            plain = self._plain_moments(moments, visible_offset, hidden_offset)
-            value = self._energy_of(plain) + self._of_measures(v, h, weight)
-        surrogate = self._energy_of(moments)
-        curvature = self.visible.curvature
-        if curvature is not None and curvature.requires_grad:
-            with torch.no_grad():
-                centred = v - visible_offset.unsqueeze(-2)
-                squares = 0.5 * (weight.unsqueeze(-2) @ centred.square()).squeeze(-2)
-                along = _learned(self.visible, squares.device) * visible_offset * squares
-            surrogate = surrogate + vecdot(curvature, squares) + vecdot(self.b, along)
+            centred = _centred(parts, *offsets)
+            moments = self._own_moments(self._moments(centred), *offsets)
+            plain = self._plain_moments(moments, *offsets)
+            value = self._energy_of(plain) + self._of_measures(parts)
+        surrogate = self._energy_of(moments) + self._of_centred_measures(centred, visible_offset)
         return value + (surrogate - surrogate.detach())
 
-    def _of_measures(self, v: Tensor, h: Tensor, weight: Tensor) -> Tensor | float:
+    @with_gradient()
+    def add_gradient(
+        self, parts: Sequence[Weighted], offsets: tuple[Tensor, Tensor] | None = None, *, valued: bool = True
+    ) -> PerReplica | None:
+        """Add to the parameters' gradients those of :meth:`total_energy` over all parts together.
+
+        Couplings and biases need no graph: their gradients are the moments. What the units have of their own goes
+        through autograd.
+
+        Args:
+            parts: Configurations and their weights.
+            offsets: Of visible and hidden units, for :meth:`centred_total_energy`; None is the plain energy.
+            valued: Whether to return the sum, which a loop that nothing looks at does without.
+        """
+        if self.b.dtype.itemsize < 4:  # of few digits: a sum over one part must not be rounded before the next
+            v, h, weight = zip(*parts, strict=True)
+            parts = [Weighted(torch.cat(v, dim=-2), torch.cat(h, dim=-2), torch.cat(weight, dim=-1))]
+        with torch.no_grad():
+            falling = [part._replace(weight=-part.weight) for part in parts]
+            moments = self._moments(falling if offsets is None else _centred(falling, *offsets))
+            if offsets is not None:
+                moments = self._own_moments(moments, *offsets)
+            value: Tensor | float = 0.0
+            if valued:  # now, as gradients may take the moments' place
+                value = -self._energy_of(moments if offsets is None else self._plain_moments(moments, *offsets))
+            for parameter, moment in self._by_parameter(moments):
+                if parameter.requires_grad:
+                    parameter.grad = moment if parameter.grad is None else parameter.grad.add_(moment)
+        measures = own = self._of_measures(parts) if valued or offsets is None else 0.0
+        if offsets is not None:
+            own = self._of_centred_measures(_centred(parts, *offsets), offsets[0])
+        if isinstance(own, Tensor) and own.requires_grad:
+            own.sum().backward()
+        return torch.as_tensor(value + measures).detach() if valued else None
+
+    def _of_measures(self, parts: Sequence[Weighted]) -> Tensor | float:
         """Weighted sum of ``-log mu`` over configurations."""
         total: Tensor | float = 0.0
-        for units, x in ((self.visible, v), (self.hidden, h)):
-            if not units.linear:
-                total = total + units.total_energy(x, weight)
+        for v, h, weight in parts:
+            for units, x in ((self.visible, v), (self.hidden, h)):
+                if not units.linear:
+                    total = total + units.total_energy(x, weight)
+        return total
+
+    def _of_centred_measures(self, centred: Sequence[Weighted], visible_offset: Tensor) -> Tensor | float:
+        """What learned precisions add to the surrogate whose gradient is that of centred units."""
+        curvature = self.visible.curvature
+        if curvature is None or not curvature.requires_grad:
+            return 0.0
+        with torch.no_grad():
+            squares = 0.5 * sum((weight.unsqueeze(-2) @ v.square()).squeeze(-2) for v, _, weight in centred)
+            along = _learned(self.visible, visible_offset.device) * visible_offset * squares
+        total: Tensor = vecdot(curvature, squares) + vecdot(self.b, along)
         return total
 
     @abstractmethod
-    def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> Sequence[Tensor]:
+    def _moments(self, parts: Sequence[Weighted]) -> Sequence[Tensor]:
         """Weighted sums over configurations of what the parameters are multiplied with."""
 
     @abstractmethod
-    def _centred_moments(
-        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    def _own_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
     ) -> Sequence[Tensor]:
-        """The same sums of the centred parametrisation, turned into those of the model's own parameters."""
+        """Moments of centred units as steps of the model's own parameters."""
 
     @abstractmethod
     def _plain_moments(
         self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
     ) -> Sequence[Tensor]:
-        """What :meth:`_moments` gives, from the centred ones of weights that add up to 0: no sums over rows."""
+        """What :meth:`_moments` gives, from those of weights that add up to 0 after :meth:`_own_moments`."""
+
+    @abstractmethod
+    def _by_parameter(self, moments: Sequence[Tensor]) -> list[tuple[nn.Parameter, Tensor]]:
+        """Couplings and biases, each with its moment."""
 
     @abstractmethod
     def _energy_of(self, moments: Sequence[Tensor]) -> Tensor:
         """Minus the sum over the parameters of each one times its moment, ``(*replicas,)``."""
+
+
+def _centred(parts: Sequence[Weighted], visible_offset: Tensor, hidden_offset: Tensor) -> list[Weighted]:
+    mu, lam = visible_offset.unsqueeze(-2), hidden_offset.unsqueeze(-2)
+    return [Weighted(v - mu, h - lam, weight) for v, h, weight in parts]
 
 
 def _learned(units: Units, device: torch.device) -> Tensor:

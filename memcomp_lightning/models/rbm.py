@@ -7,13 +7,13 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.affine import affine, plus_product
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Initialiser, initial
 from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
-from memcomp_lightning.models.units import Bernoulli, Units, all_states
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.models.units import Units, all_states
+from memcomp_lightning.types import Configurations, Weighted
 
 
 class RBM(Machine):
@@ -80,23 +80,28 @@ class RBM(Machine):
         hidden_part = (self.hidden_field(v) * h).sum(-1)
         return -hidden_part - (v * self.b.unsqueeze(-2)).sum(-1)
 
-    def _moments(self, v: Tensor, h: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        weighted_h = h * weight.unsqueeze(-1)
-        if isinstance(self.visible, Bernoulli):
-            weighted_v = v * weight.unsqueeze(-1)
-            return h.mT @ weighted_v, weighted_v.sum(-2), weighted_h.sum(-2)
-        # Entries of categorical units are many: no copy of them.
-        return weighted_h.mT @ v, (weight.unsqueeze(-2) @ v).squeeze(-2), weighted_h.sum(-2)
+    def _moments(self, parts: Sequence[Weighted]) -> tuple[Tensor, Tensor, Tensor]:
+        of_weight = of_b = of_c = None
+        for v, h, weight in parts:
+            # A weighted copy of the hidden units alone: entries of categorical visible ones are many.
+            weighted_h, each = h * weight.unsqueeze(-1), weight.unsqueeze(-2)
+            of_weight = plus_product(of_weight, weighted_h.mT, v)
+            of_b, of_c = plus_product(of_b, each, v), plus_product(of_c, each, h)
+        assert of_weight is not None
+        assert of_b is not None
+        assert of_c is not None
+        return of_weight, of_b.squeeze(-2), of_c.squeeze(-2)
 
-    def _centred_moments(
-        self, v: Tensor, h: Tensor, weight: Tensor, visible_offset: Tensor, hidden_offset: Tensor
+    def _own_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        centred_v = v - visible_offset.unsqueeze(-2)
-        weighted_h = (h - hidden_offset.unsqueeze(-2)) * weight.unsqueeze(-1)
-        of_weight = weighted_h.mT @ centred_v
-        of_b = (centred_v * weight.unsqueeze(-1)).sum(-2) - (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
-        of_c = weighted_h.sum(-2) - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
+        of_weight, of_b, of_c = centred
+        of_b = of_b - (hidden_offset.unsqueeze(-2) @ of_weight).squeeze(-2)
+        of_c = of_c - (of_weight @ visible_offset.unsqueeze(-1)).squeeze(-1)
         return of_weight, of_b, of_c
+
+    def _by_parameter(self, moments: Sequence[Tensor]) -> list[tuple[nn.Parameter, Tensor]]:
+        return list(zip((self.weight, self.b, self.c), moments, strict=True))
 
     def _plain_moments(
         self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor

@@ -297,8 +297,14 @@ class EnergyPretraining(StageModule):
         step, generator = self._step(), self.streams["negative_phase"]
         if self._state.sampler is None and self.earlier is not None:
             self._go_on(step, positive.v.shape[-2])
-        gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
-        loss = step.loss(self.model, gap, batch.share)
+        if self.trainer.world_size > 1:  # the processes add their gradients up in the backward pass
+            gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
+            loss = step.loss(self.model, gap, batch.share)
+        else:
+            followed = step.add_gradient(self.model, positive, self._state, share=batch.share, generator=generator)
+            gap, negative, self._state = cast(tuple[Tensor, NegativePhase[object], StepState], followed)
+            with torch.no_grad():
+                loss = step.loss(self.model, gap, batch.share)
         self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
         gap_so_far = self._gap + batch.share * gap.detach()
         self._gap = gap_so_far

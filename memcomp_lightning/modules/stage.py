@@ -144,6 +144,11 @@ class StageModule(pl.LightningModule):
                     f"({self.stage}.optimizer.lr) and start a new run."
                 )
 
+    def backward(self, loss: Tensor, *arguments: Any, **settings: Any) -> None:
+        """Nothing for a loss without a graph: its gradient has been added already."""
+        if loss.requires_grad:
+            super().backward(loss, *arguments, **settings)
+
     def on_train_batch_end(self, *_: object) -> None:
         """Keep a wish to stop until the end of the pass."""
         self._keep_wish()

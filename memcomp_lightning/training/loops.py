@@ -153,10 +153,14 @@ class PhaseTraining:
             with torch.no_grad():
                 _, found = phase.positive_of(batch, self.streams["positive_phase"])
                 positive = weighted(found.configurations, batch.weight)
-            gap, _, state = self.step.contrast(
-                phase.model, positive, state, generator=self.streams["negative_phase"]
+            _, _, state = self.step.add_gradient(
+                phase.model,
+                positive,
+                state,
+                share=batch.share,
+                generator=self.streams["negative_phase"],
+                valued=False,
             )
-            self.step.loss(phase.model, gap, batch.share).backward()
             if batch.closes_step:
                 self.optimizer.step()
                 phase.model.project()

@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
+import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.models.base import EnergyModel
-from memcomp_lightning.objective import Centring, Offsets, contrast
+from memcomp_lightning.objective import Centring, Offsets, add_gradient, contrast
 from memcomp_lightning.samplers.base import NegativePhaseSampler, require_sampler
 from memcomp_lightning.training.penalties import Penalty, with_penalties
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -79,13 +80,29 @@ class EnergyStep:
             state: What the call before returned, ``after_update()`` where the update was complete.
             generator: Of the negative phase.
         """
-        offsets, negative = state.offsets, state.negative
-        if negative is None and self.centring is not None:
-            offsets = Offsets(*map(self.processes.mean, self.centring.follow(offsets, positive)))
-        if negative is None or self.sampler.uses_data:
-            negative = self._negative_phase(model, positive, state.sampler, generator)
-        gap = contrast(model, positive, negative.configurations, offsets)
-        return gap, negative, StepState(negative.state, offsets, negative)
+        negative, state = self._begun(model, positive, state, generator)
+        return contrast(model, positive, negative.configurations, state.offsets), negative, state
+
+    def add_gradient(
+        self,
+        model: EnergyModel,
+        positive: Configurations,
+        state: StepState,
+        *,
+        share: float,
+        generator: Generator,
+        valued: bool = True,
+    ) -> tuple[Tensor | None, NegativePhase[object], StepState]:
+        """Add the gradient of a batch to those of the parameters; return as :meth:`contrast`, without a graph.
+
+        ``share`` is that of the batch, as for :meth:`loss`. With ``valued=False`` nobody looks at the contrast,
+        and None may be in its place.
+        """
+        negative, state = self._begun(model, positive, state, generator)
+        gap = add_gradient(model, positive, negative.configurations, state.offsets, share=share, valued=valued)
+        if self.penalties:
+            self.loss(model, torch.zeros_like(model.b[..., 0]), share).backward()
+        return gap, negative, state
 
     def loss(self, model: EnergyModel, gap: Tensor, share: float) -> Tensor:
         """Return what a batch adds to the loss of the update, whose gradient is followed, a scalar.
@@ -99,6 +116,17 @@ class EnergyStep:
             share: Of the batch, see :class:`memcomp_lightning.types.Batch`.
         """
         return share * with_penalties(gap, model, self.penalties).sum()
+
+    def _begun(
+        self, model: EnergyModel, positive: Configurations, state: StepState, generator: Generator
+    ) -> tuple[NegativePhase[object], StepState]:
+        """The negative phase for a batch, and the state after it."""
+        offsets, negative = state.offsets, state.negative
+        if negative is None and self.centring is not None:
+            offsets = Offsets(*map(self.processes.mean, self.centring.follow(offsets, positive)))
+        if negative is None or self.sampler.uses_data:
+            negative = self._negative_phase(model, positive, state.sampler, generator)
+        return negative, StepState(negative.state, offsets, negative)
 
     def _negative_phase(
         self, model: EnergyModel, positive: Configurations, state: object, generator: Generator

@@ -66,7 +66,7 @@ def test_exact_phases_learn_the_data(kind: str, centring: Centring | None) -> No
         Boltzmann(model, positive=ExactPosterior()),
         Exact(),
         iterations={"DBM": 400, "full": 150}[kind],
-        optimizer=partial(torch.optim.SGD, lr=1.0, momentum=0.5),
+        optimizer=partial(torch.optim.SGD, lr={"DBM": 1.0, "full": 0.5}[kind], momentum=0.5),
         centring=centring,
     )
     v = bars().images.train_v

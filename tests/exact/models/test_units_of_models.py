@@ -531,8 +531,8 @@ MUTANTS = {
     ),
     "centred: not at all": (
         RBM,
-        "_centred_moments",
-        lambda _: lambda s, v, h, w, *o: s._moments(v, h, w),
+        "_own_moments",
+        lambda _: lambda s, centred, *o: s._plain_moments(centred, *o),
         check_centred,
         "spins x bits",
     ),
