@@ -95,7 +95,8 @@ def maximised(counts: Tables, pseudocount: float, means: Real) -> Tables:
 def first_tables(states: int, train: Rows, means: Real, generator: np.random.Generator) -> Tables:
     """A state is a random row of the table, the same one in all columns, and steps keep it half of the time.
 
-    From random tables EM ends lower: on plants by half a nat, on mushrooms by two tenths to a nat.
+    From random tables EM mostly ends lower on validation rows: with 8 states by .5 nats on plants, 1.0 on
+    mushrooms, .3 on nips, .02 on nltcs, .01 on dna; with 16 by .1 on mushrooms, but higher by .05 on dna.
     """
     n = train.shape[1]
     rows = train[generator.choice(len(train), states, replace=len(train) < states)]

@@ -2,7 +2,7 @@
 
     PEERS/bin/python experiments/density/peers.py --list
     PEERS/bin/python experiments/density/peers.py masked --train plants.train.csv.gz --valid plants.valid.csv.gz \\
-        --test plants.test.csv.gz --settings '{"masks": 8, "hidden": 500}' --seed 0 --out masked.json
+        --test plants.test.csv.gz --settings '{"masks": 8, "hidden": 100}' --seed 0 --out masked.json
 
 PEERS is an environment of its own, without memcomp_lightning:
 
@@ -138,11 +138,11 @@ PEERS = {
         "masked:masked",
         {
             "masks": [1, 8, 32],
-            "hidden": [100, 500, 1000],
             "rate": [3e-4, 1e-3, 3e-3],
-            "decay": [0.01, 0.1, 1.0],
+            "hidden": [100, 500, 1000],
+            "decay": [0.01, 0.1, 0.3],
         },
-        {"masks": 8, "hidden": 500, "rate": 1e-3, "decay": 0.01},
+        {"masks": 32, "rate": 1e-3, "hidden": 500, "decay": 0.01},
         _NUMPY | {"torch": "torch==2.13.0"},
     ),
     "sklearn_rbm": Peer(
