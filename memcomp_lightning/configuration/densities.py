@@ -50,10 +50,10 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     peers = _peers(density)
     for name in density.only or ():
         require_choice("density.only", name, (*density.models, *peers))
-    files = {table: _files(density, table) for table in density.tables}
+    files = {table: files_of(density, table) for table in density.tables}
     first = density.tables[0]
     for name in _models(density):  # on one table alone: building takes a second
-        trial = _trial(density, overrides, first, files[first], name, density.start_of(name), choosing=True)
+        trial = trial_of(density, overrides, first, files[first], name, density.start_of(name), choosing=True)
         own = OmegaConf.create(trial.settings)
         plan = build(own)
         check_without_trainer(plan, own)
@@ -78,13 +78,13 @@ def _missing(
     density: Density, peers: Mapping[str, Peer], overrides: Sequence[str], table: str, records: Records
 ) -> Iterator[DensityTrial | PeerTrial]:
     """What the records of a table lack: settings that a search asks for next, or the one that it chose."""
-    files, done = _files(density, table), records.keys
+    files, done = files_of(density, table), records.keys
     for name in _models(density):
         axes, start = density.axes_of(name), density.start_of(name)
         judged = _judged(records.all, table, name)
         asked = missing(axes, start, judged)
         for setting in asked or [best_of(axes, start, judged)]:
-            trial = _trial(density, overrides, table, files, name, setting, choosing=bool(asked))
+            trial = trial_of(density, overrides, table, files, name, setting, choosing=bool(asked))
             if trial.key not in done:
                 yield trial
     for name, peer in peers.items():
@@ -139,7 +139,7 @@ def _fit(
     )
 
 
-def _trial(
+def trial_of(
     density: Density,
     overrides: Sequence[str],
     table: str,
@@ -149,6 +149,7 @@ def _trial(
     *,
     choosing: bool,
 ) -> DensityTrial:
+    """The trial of a model of the comparison at one setting; a choosing one has another seed, and no test rows."""
     model = density.models[name]
     at = f"density.models.{name}"
     common = (*(_filled_in(one, setting, "density.overrides") for one in density.overrides), *overrides)
@@ -204,7 +205,7 @@ def _points(passes: int, n: int) -> tuple[int, ...]:
     return tuple(sorted({max(1, round(passes / 1.5**k)) for k in range(n)}))
 
 
-def _files(density: Density, table: str) -> Files:
+def files_of(density: Density, table: str) -> Files:
     """Of training, held-out and test rows."""
     given = density.folder
     if given is None and "MEMCOMP_DATA_DIR" not in os.environ:

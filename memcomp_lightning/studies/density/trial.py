@@ -124,7 +124,7 @@ class DensityTrial(Trial):
         trained.load_state_dict(best.weights)
         (test, _), betas = data.test, self.density.betas
         scores = scores_of(trained, train, [test, held_out], betas, 2 * self.density.chains)
-        base = _independent(train, test)
+        base = independent_bits(train, test)
         found = {"test": scores[0].up, "test_reverse": scores[0].down, "standard_error": scores[0].standard_error}
         found |= {"valid_best": scores[1].least, "independent": base.expand_as(scores[0].up)}
         return [replace(record, measures={**measured, **{name: [x.tolist()] for name, x in found.items()}})]
@@ -145,10 +145,10 @@ def scores_of(model: EnergyModel, train: Tensor, rows: Sequence[Tensor], betas: 
     return [Scores(mean - up, mean - down, error) for mean in of_rows]
 
 
-def _independent(train: Tensor, test: Tensor) -> Tensor:
-    """Mean log-likelihood of test rows by independent bits with the means of the training rows, one more each."""
+def independent_bits(train: Tensor, rows: Tensor) -> Tensor:
+    """Mean log-likelihood of rows by independent bits with the means of the training rows, one row more of each."""
     p = (train.double().sum(0) + 1) / (len(train) + 2)
-    return torch.where(test > 0.5, p.log(), (-p).log1p()).sum(-1).mean()
+    return torch.where(rows > 0.5, p.log(), (-p).log1p()).sum(-1).mean()
 
 
 def _warm_up(model: EnergyModel, sampler: Any, v: Tensor) -> None:
