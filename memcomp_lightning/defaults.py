@@ -12,6 +12,18 @@ PASSES = 10
 LEARNING_RATE = 0.05
 """Of an RBM, by plain gradient descent."""
 
+TABLE_BATCH_SIZE = 100
+"""Samples an update of an RBM of a table: of ``data=table`` and ``MemcompRBM``; chosen in experiments/density."""
+
+TABLE_LEARNING_RATE = 0.1
+"""Of its first update."""
+
+TABLE_LAST_RATE = 0.01
+"""Share of it in the last pass, to which it falls linearly."""
+
+TABLE_UPDATES = 10_000
+"""Updates, where no passes are given; there are ten passes at least."""
+
 N_CHAINS = 100
 """Persistent chains."""
 

@@ -22,6 +22,7 @@ from memcomp_lightning.callbacks.base import (
 )
 from memcomp_lightning.callbacks.sampler_diagnostics import chains_persist
 from memcomp_lightning.errors import require_choice, require_count
+from memcomp_lightning.likelihood.chains import MOST_BEHIND
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import RBM, EnergyModel
 from memcomp_lightning.models.machine import log2_states
@@ -33,9 +34,6 @@ QUICKLY_ENUMERATED = 16
 QUICKLY_ANNEALED = 10**10
 """Products in all chains and steps of AIS that "auto" computes at most, see ``annealing_products``: a second."""
 
-
-MOST_BEHIND = 1.0
-"""Nats by which log Z from the sampler's chains may stay below log Z by annealing."""
 
 log = logging.getLogger(__name__)
 

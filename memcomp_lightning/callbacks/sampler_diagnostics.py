@@ -10,6 +10,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.callbacks.base import EveryIterations, log_scalars, model_of, prefix_of, required
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.models.units import Bernoulli, Units
+from memcomp_lightning.samplers.base import holds_chains
 from memcomp_lightning.types import Configurations
 
 
@@ -122,11 +123,4 @@ def chains_persist(module: pl.LightningModule) -> bool:
         return True
     model = model_of(module)
     widths = (model.n_visible, model.n_visible + model.n_hidden)
-    return _holds_chains(init(model, 1, generator=rng.stream(0, "check")), widths)
-
-
-def _holds_chains(state: object, widths: tuple[int, ...]) -> bool:
-    """Whether a sampler's state, or one in it, holds states of the visible units or of all."""
-    if isinstance(state, Tensor):
-        return state.ndim >= 2 and state.shape[-1] in widths
-    return isinstance(state, tuple) and any(_holds_chains(part, widths) for part in state)
+    return holds_chains(init(model, 1, generator=rng.stream(0, "check")), widths)

@@ -53,6 +53,10 @@ class MemcompEstimator(NestedSettings):
     def _batches(self, samples: Samples) -> Batches:
         """The updates of a pass over scaled samples."""
 
+    def _n_passes(self, samples: Samples) -> int:
+        """Passes of ``fit``."""
+        return int(self.n_iter)
+
     @abstractmethod
     def _score_held_out(self, samples: Samples) -> float:
         """What early stopping maximises."""
@@ -72,7 +76,8 @@ class MemcompEstimator(NestedSettings):
         return samples._replace(X=self._scaling.apply(samples.X))
 
     def _check_settings(self) -> None:
-        require_count("n_iter", self.n_iter)
+        if self.n_iter is not None:
+            require_count("n_iter", self.n_iter)
         if self.batch_size is not None:
             require_count("batch_size", self.batch_size)
         self._optimizer()
@@ -101,12 +106,13 @@ class MemcompEstimator(NestedSettings):
         """Do the passes of ``fit``; held-out samples say when to stop, and choose the weights."""
         batches, scores = self._batches(samples), list[float]()
         best = BestPass(patience=self.n_iter_no_change if self.early_stopping else None, tolerance=self.tol)
-        for _ in range(self.n_iter):
+        n_passes = self._n_passes(samples)
+        for _ in range(n_passes):
             self._run_pass(batches)
             score = None if held_out is None else self._score_held_out(held_out)
             if self.verbose:
                 said = "" if score is None else f", score of held-out samples {score:.4f}"
-                print(f"[{type(self).__name__}] pass {self.n_iter_} of {self.n_iter}{said}", flush=True)
+                print(f"[{type(self).__name__}] pass {self.n_iter_} of {n_passes}{said}", flush=True)
             if score is not None:
                 scores.append(score)
                 best.offer(torch.tensor(score, dtype=torch.float64), network.state_dict())

@@ -1,5 +1,7 @@
 """The restricted Boltzmann machine as a transformer."""
 
+import math
+import warnings
 from dataclasses import KW_ONLY, dataclass
 from typing import Self
 
@@ -7,14 +9,22 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import ClassNamePrefixFeaturesOutMixin, TransformerMixin
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import train_test_split
 from sklearn.utils.validation import check_is_fitted
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
 from memcomp_lightning.data import Batches
-from memcomp_lightning.defaults import LEARNING_RATE, N_CHAINS, PASSES, WEIGHT_STD
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.defaults import (
+    N_CHAINS,
+    TABLE_BATCH_SIZE,
+    TABLE_LAST_RATE,
+    TABLE_LEARNING_RATE,
+    TABLE_UPDATES,
+    WEIGHT_STD,
+)
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.estimators.base import (
     MemcompEstimator,
     RandomState,
@@ -39,9 +49,13 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
     log_pseudo_likelihood,
 )
+from memcomp_lightning.likelihood.chains import MOST_BEHIND, gap_of_chains
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.samplers import PCD
-from memcomp_lightning.training import Greedy, PhaseTraining, require_finite
+from memcomp_lightning.training import Greedy, LearningRateDecay, PhaseTraining, require_finite
+
+MOST_WEIGHTS = 2**18
+"""Weights up to which ``fit`` looks whether its chains are behind."""
 
 MOST_ENUMERATED = 20
 """Units of the smaller layer up to which a log-likelihood is exact."""
@@ -63,8 +77,11 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         sampler: Supplies the negative phase; None is ``PCD(n_chains=100)``. Its settings are ``sampler__k`` and so
             on, for ``set_params`` and searches.
         learning_rate: Of plain gradient descent, > 0.
+        last_rate: Share of the learning rate in the last pass of ``fit``, to which it falls linearly, in (0, 1].
+            At a rate that stays chains lag behind the model and may stop mixing.
         batch_size: Samples an update, >= 1; None means all.
-        n_iter: Passes over the data, >= 1; with ``early_stopping`` at most so many.
+        n_iter: Passes over the data, >= 1; with ``early_stopping`` at most so many. None makes up 10,000 updates,
+            in ten passes at least.
         centred: Follow the centred gradient.
         early_stopping: Hold out samples, stop once their :meth:`score` no longer rises, and keep the weights of
             the best pass.
@@ -86,8 +103,10 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
 
     n_components: int = 64
     _: KW_ONLY
-    learning_rate: float = LEARNING_RATE
-    n_iter: int = PASSES
+    learning_rate: float = TABLE_LEARNING_RATE
+    last_rate: float = TABLE_LAST_RATE
+    batch_size: int | None = TABLE_BATCH_SIZE
+    n_iter: int | None = None
 
     def _default_sampler(self) -> PCD:
         return PCD(n_chains=N_CHAINS)
@@ -114,8 +133,9 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             )
             samples, held_out = samples.take(rows), samples.take(others)
         with on_the_cpu():
-            self._begin(samples, seed)
+            self._begin(samples, seed, n_passes=self._n_passes(samples))
             self._run_passes(self.rbm_, samples, held_out)
+            self._warn_if_chains_are_behind()
         return self
 
     def partial_fit(self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None) -> Self:
@@ -137,13 +157,22 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
 
     def _check_settings(self) -> None:
         require_count("n_components", self.n_components)
+        require(0 < self.last_rate <= 1, "last_rate", self.last_rate, "a share in (0, 1]")
         super()._check_settings()
 
     def _read_samples(self, X: ArrayLike, sample_weight: ArrayLike | None, *, reset: bool) -> Samples:
         data = self._read(X, reset=reset)
         return Samples.that_count(data, np.zeros(data.shape[0], dtype=np.int64), sample_weight)
 
-    def _begin(self, samples: Samples, seed: int) -> None:
+    def _n_passes(self, samples: Samples) -> int:
+        if self.n_iter is not None:
+            return int(self.n_iter)
+        n: int = samples.X.shape[0]
+        return max(10, round(TABLE_UPDATES / math.ceil(n / min(self.batch_size or n, n))))
+
+    def _begin(self, samples: Samples, seed: int, n_passes: int | None = None) -> None:
+        """Draw weights; the rate falls over ``n_passes``, and stays where None is given."""
+        falls = n_passes is not None and self.last_rate < 1
         dbn = dbn_for(samples.X, [int(self.n_components)], std=WEIGHT_STD, generator=rng.stream(seed, "weights"))
         rbm = dbn[0]
         self._base = log_odds_of(samples).to(rbm.b)
@@ -153,10 +182,26 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             Greedy(dbn).phases[0],
             self._negative_phase(),
             optimizer=self._optimizer(),
+            schedules=[LearningRateDecay(n_passes, self.last_rate)] if falls and n_passes else [],
             centring=self._centring(),
             streams=rng.streams(seed, ("negative_phase", "positive_phase")),
         )
         self._gibbs_generator = rng.stream(seed, "gibbs")
+
+    def _warn_if_chains_are_behind(self) -> None:
+        """Say so where persistent chains are no samples of the model, if that takes less than about a second."""
+        chains, rbm = self._training.chains(rng.stream(self._seed, "check")), self.rbm_
+        if chains is None or rbm.n_visible * rbm.n_hidden > MOST_WEIGHTS:
+            return
+        gap = float(gap_of_chains(rbm, chains, base=self._base))
+        if gap > MOST_BEHIND:
+            warnings.warn(
+                f"The chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing, and "
+                "the model may be worse than earlier. Lower learning_rate or last_rate, or take more chains or "
+                "several temperatures: sampler=memcomp_lightning.samplers.ParallelTempering().",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
 
     def _batches(self, samples: Samples) -> Batches:
         sampler = self._negative_phase()

@@ -49,6 +49,13 @@ def positive_phase(model: EnergyModel, v: Tensor) -> Configurations:
     return Configurations(v, model.hidden_mean(v))
 
 
+def holds_chains(state: object, widths: tuple[int, ...]) -> bool:
+    """Whether a sampler's state, or one in it, holds states of so many units, which go on from there."""
+    if isinstance(state, Tensor):
+        return state.ndim >= 2 and state.shape[-1] in widths
+    return isinstance(state, tuple) and any(holds_chains(part, widths) for part in state)
+
+
 def require_sampler(name: str, sampler: object) -> None:
     """Raise unless an object has what :class:`NegativePhaseSampler` asks for."""
     require_parts(name, sampler, "sampler of the negative phase", ("init", "sample", "uses_data", "shared"))

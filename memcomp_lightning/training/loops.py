@@ -16,6 +16,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import Centring, weighted
+from memcomp_lightning.samplers.base import holds_chains, positive_phase
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import JUDGED_BY, BestPass
 from memcomp_lightning.training.diverged import require_finite
@@ -137,6 +138,18 @@ class PhaseTraining:
         self.optimizer = optimizer(phase.model.parameters())
         self.passes_done = 0
         self._state = StepState()
+
+    def chains(self, generator: Generator) -> Tensor | None:
+        """Visible states of chains that go on from update to update, one sweep further; None without.
+
+        Two or more of them; the training itself does not see the sweep.
+        """
+        state, model, sampler = self._state.sampler, self.phase.model, self.step.sampler
+        if state is None or not holds_chains(state, (model.n_visible, model.n_visible + model.n_hidden)):
+            return None
+        nothing = model.b.new_zeros(*model.replicas, 1, model.n_visible)
+        found = sampler.sample(model, state, positive_phase(model, nothing), generator=generator).configurations
+        return found.v if found.weight is None and found.v.shape[-2] > 1 else None
 
     def go_on_with(self, sampler: Sampler, centring: Centring | None) -> None:
         """Take other settings for the passes that follow; another sampler starts anew."""

@@ -146,7 +146,7 @@ def scores_of(model: EnergyModel, train: Tensor, rows: Sequence[Tensor], betas: 
 
 
 def independent_bits(train: Tensor, rows: Tensor) -> Tensor:
-    """Mean log-likelihood of rows by independent bits with the means of the training rows, one row more of each."""
+    """Mean log-likelihood of rows by independent bits with the means of training rows, one more of each value."""
     p = (train.double().sum(0) + 1) / (len(train) + 2)
     return torch.where(rows > 0.5, p.log(), (-p).log1p()).sum(-1).mean()
 
