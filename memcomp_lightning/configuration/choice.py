@@ -49,6 +49,7 @@ def for_trial(config: DictConfig, value: float) -> DictConfig:
     chosen = with_choice(config, value)
     if config.data.get("validation") is None:
         chosen.data.validation_fraction = config.data.validation_fraction or HELD_OUT
+    chosen.pretrain.keep_best = False  # trials train without a trainer, to the end
     return chosen
 
 

@@ -192,6 +192,7 @@ def _run_settings(passes: int) -> tuple[str, ...]:
         f"pretrain.iterations={passes}",
         "finetune.iterations=0",
         "pretrain.schedules.momentum=null",
+        "pretrain.keep_best=false",
         f"pretrain.schedules.decay={decay}",
     )
 

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import logging
 import math
 import re
 from collections.abc import Callable, Hashable, Mapping
@@ -52,6 +53,8 @@ if TYPE_CHECKING:
 
     Data: TypeAlias = ImageData | TableData | SequenceData
 
+log = logging.getLogger(__name__)
+
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
 _OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every", "continue")
@@ -75,6 +78,12 @@ _SETTINGS = {
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
 
+
+HELD_OUT = 0.1
+"""Share of a table's training rows that is held out where none is typed."""
+
+FEWEST_TO_HOLD_OUT = 200
+"""Training rows below which none are held out so."""
 
 FEWEST_PASSES = 10
 """Of pretraining whose length is given in updates."""
@@ -226,6 +235,8 @@ def plan_of(settings: Mapping[str, object]) -> Plan:
 
 def check_without_trainer(plan: Plan, config: DictConfig) -> None:
     """Refuse callbacks and limits that change training: a loop without a trainer would leave them out."""
+    allowed = "false: figures, comparisons and choices train without a trainer, to the end"
+    require(not config.pretrain.keep_best, "pretrain.keep_best", config.pretrain.keep_best, allowed)
     for stage in plan.stages:
         for callback in stage.callbacks:
             check_bare_loop(callback, f"callbacks.{stage.module.stage}")
@@ -384,7 +395,8 @@ def _with_best_likelihood(
 ) -> list[pl.Callback]:
     """The callbacks with one that keeps the best weights in the place of the one that measures likelihoods."""
     if not rows.holds_out:
-        require_held_out(config, "where pretrain.keep_best is true", "pass")
+        log.info("No rows are held out to choose the best weights of pretraining by: its last ones stay.")
+        return callbacks
     own = config.callbacks.pretrain.get("log_likelihood") or {}
     settings = {str(name): value for name, value in own.items() if name != "_target_"}
     best = BestLikelihood(**settings, patience=config.pretrain.patience)
@@ -408,6 +420,9 @@ def _sampler(config: DictConfig, data: RowsDataModule, iterations: int) -> Any:
 def _data(config: DictConfig, stage: str, data: "Data", units: Units) -> RowsDataModule:
     """Batches of a stage: fine-tuning takes the rows that have a label, or as many as it is told."""
     settings = {name: config.data[name] for name in _DEALT}
+    if settings["validation_fraction"] is None:
+        alone = isinstance(data, ImageData) or data.validation is not None or data.train.n < FEWEST_TO_HOLD_OUT
+        settings["validation_fraction"] = 0.0 if alone or not config.pretrain.keep_best else HELD_OUT
     settings |= {"batch_size": config[stage].batch_size, "seed": config.seed}
     if stage == "finetune":
         settings["labels"] = "all" if config.finetune.labels is None else config.finetune.labels

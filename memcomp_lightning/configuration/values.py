@@ -42,7 +42,7 @@ def require_held_out(config: DictConfig, where: str, chosen: str) -> None:
     remedy = f"The test images would choose the {chosen}."
     if "validation" in config.data:
         remedy += " Or give rows to judge by: data.validation=FILE."
-    require(has_file or share > 0, "data.validation_fraction", share, allowed, remedy)
+    require(has_file or (share or 0) > 0, "data.validation_fraction", share, allowed, remedy)
 
 
 def _check_finite(node: Any, name: str = "") -> None:

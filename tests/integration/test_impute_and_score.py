@@ -218,11 +218,11 @@ def test_the_data_of_a_run_are_read_again(run: str, tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     loaded = load(run)
     found = training_rows(loaded)
-    assert (found.train.n, found.heldout.n) == (270, 30)
+    assert (found.train.n, found.heldout.n) == (243, 27)
     both = torch.cat((found.train.v, found.heldout.v))
     everybody = loaded.needed_schema.read(Path("people.csv")).v
-    assert sorted(both.tolist()) == sorted(everybody.tolist())
-    assert training_rows(loaded, most=100).train.n == 90
+    assert {tuple(row) for row in both.tolist()} <= {tuple(row) for row in everybody.tolist()}
+    assert training_rows(loaded, most=100).train.n == 81
     path = Path("run/settings.yaml")
     path.write_text(path.read_text().replace("memcomp_lightning.data.Table", "os.system"))
     with pytest.raises(

@@ -97,7 +97,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     if values:
         allowed = "null where the data have no labels: accuracy on held-out rows chooses"
         require(plans[0].finetuning is not None, "choose.setting", config.choose.setting, allowed)
-        check_without_trainer(plans[0], config)
+        check_without_trainer(plans[0], for_trial(config, values[0]))
     check_trainers(plans[0], config)
 
 
