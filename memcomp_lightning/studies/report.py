@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, write_text, written_whole
 from memcomp_lightning.studies.density import read_densities
+from memcomp_lightning.studies.density.events import write_events as density_events
 from memcomp_lightning.studies.density.plot import density_figures
 from memcomp_lightning.studies.density.results import DENSITY_RULE, density_table, density_verdicts
 from memcomp_lightning.studies.page import Section, markdown
@@ -49,6 +50,7 @@ def write_report(folder: Path) -> Section:
         name, title, rule = densities.plan.name, densities.plan.title, DENSITY_RULE
         figures, numbers = density_figures(densities), as_csv(density_table(densities))
         judged = density_verdicts(densities)
+        density_events(densities, folder / "tensorboard")
     else:
         results = read_results(folder)
         _check_measured(folder, bool(results.curves))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from running import Outcome
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from memcomp_lightning.studies import Record, Records
 
@@ -85,6 +86,10 @@ def test_settings_are_searched_and_reported_once_and_a_run_goes_on(memcomp_train
     assert "CD-1 is ahead of all peers" in outcome.out or "annealing" in outcome.out or "DMM" in outcome.out
     for name in ("density.png", "density_small.png", "density.csv", "verdicts.md", "report.html"):
         assert Path("run", name).stat().st_size > 0
+
+    events = EventAccumulator("run/tensorboard/RBM, CD-1").Reload()
+    assert [event.step for event in events.Scalars("small/held-out")] == reported["cd1"].at
+    assert "small/test" in events.Tags()["scalars"]
 
     path = Path("run/records.jsonl")
     path.write_text("".join(line + "\n" for line in path.read_text().splitlines()[:-1]))
