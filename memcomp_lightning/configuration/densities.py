@@ -39,11 +39,6 @@ Files = tuple[str, str, str]
 
 def check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Find the tables, ask for the peers, and build every model at its start; raises as ``build``."""
-    if config.figure is not None:
-        raise UserError(
-            "preset=quick is one of figures: make the comparison smaller with density.tables=[TABLE], "
-            "density.only=[MODEL], density.replicas=N or density.axes.updates=[...]."
-        )
     check_not_given(overrides, _SET_BY_STUDY, "a comparison")
     density = filled(Density, config.density, "density")
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))

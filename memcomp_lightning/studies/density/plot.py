@@ -5,6 +5,9 @@ from matplotlib.figure import Figure
 
 from memcomp_lightning.studies.density.results import Densities, Found
 
+TICKS = (-30, -10, -3, -1, 0)
+"""Nats, linear above -1 and logarithmic below."""
+
 
 def density_figures(results: Densities) -> dict[str, Figure]:
     """By name: test likelihoods of all tables, and held-out likelihood against time for each."""
@@ -29,13 +32,16 @@ def _test(results: Densities) -> Figure:
             _mark(axes, names.index(name), own, top, is_model=name in results.plan.models)
         axes.axvline(0.0, color="0.7", lw=0.8)
         axes.set_title(f"{table}\nbest {top:.2f}" + ("" if floor is None else f", bits alone {floor:.1f}"), size=8)
-        axes.set_xscale("symlog", linthresh=0.5)
+        axes.set_xscale("symlog", linthresh=1.0)
+        axes.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
+        axes.set_xticks([], minor=True)
+        axes.set_xlim(right=0.5)
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.25, axis="x")
     panels[0].set_yticks(range(len(names)), [results.label(name) for name in names], size=8)
     panels[0].invert_yaxis()
     figure.supxlabel(
-        "test log-likelihood, nats a row above the best (crosses: estimates of log Z disagree)", size=8
+        "test log-likelihood less that of the best, nats a row (crosses: estimates of log Z disagree)", size=8
     )
     return figure
 

@@ -24,8 +24,8 @@ from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError
 from memcomp_lightning.training.best import BestPass
 
-ENUMERATED = 20
-"""Units of the smaller layer up to which log Z is exact."""
+ENUMERATED, ENUMERATED_AT_END = 16, 25
+"""Units of the smaller layer up to which log Z is exact, along a training and at its end."""
 
 SWEEPS = 200
 """From training rows to the states from which reverse AIS starts."""
@@ -101,7 +101,8 @@ class DensityTrial(Trial):
                 progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
                 reported = done.number
                 model, diverged = without_diverged(trained)
-                of_rows = scores_of(model, train, [held_out, train], self.density.quick_betas, self.density.chains)
+                betas, chains = self.density.quick_betas, self.density.chains
+                of_rows = scores_of(model, train, [held_out, train], betas, chains, enumerated=ENUMERATED)
                 valid = of_rows[0].least.masked_fill(diverged, -math.inf)
                 best.offer(valid, trained.state_dict())
                 record.at.append(done.number * updates)
@@ -131,9 +132,17 @@ class DensityTrial(Trial):
 
 
 @torch.no_grad()
-def scores_of(model: EnergyModel, train: Tensor, rows: Sequence[Tensor], betas: int, chains: int) -> list[Scores]:
+def scores_of(
+    model: EnergyModel,
+    train: Tensor,
+    rows: Sequence[Tensor],
+    betas: int,
+    chains: int,
+    *,
+    enumerated: int = ENUMERATED_AT_END,
+) -> list[Scores]:
     """Scores of sets of rows, by one log Z; exact where the smaller layer is small enough."""
-    if model.n_enumerated <= ENUMERATED:
+    if model.n_enumerated <= enumerated:
         up = down = log_partition_function(model)
         error = torch.zeros_like(up)
     else:
