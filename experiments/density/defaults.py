@@ -29,13 +29,13 @@ from memcomp_lightning.studies.density.trial import independent_bits
 RESULTS = Path(__file__).with_name("defaults.csv")
 COLUMNS = ["table", "sampler", "rate", "hidden", "updates", "best", "last", "independent", "seconds"]
 OVERRIDES = ["experiment=density", "density.patience=1000", "density.points=9"]
-AXES = {"rate": [0.05, 0.1, 0.2], "hidden": [64, 128], "updates": [3000, 10000]}
+AXES = {"rate": [0.05, 0.1, 0.2], "hidden": [64, 128], "updates": [10000]}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--table", action="store_true", help="train nothing")
-    parser.add_argument("--samplers", nargs="+", default=["pcd", "pt"], help="models of conf/density")
+    parser.add_argument("--samplers", nargs="+", default=["pcd", "pt", "mode_cd"], help="models of conf/density")
     parser.add_argument("--tables", nargs="+", help="all by default")
     given = parser.parse_args()
     if not given.table:
