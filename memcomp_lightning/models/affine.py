@@ -33,3 +33,8 @@ def plus_product(
     if total.ndim == 2:
         return total.addmm_(x, y)
     return total.baddbmm_(x, y) if total.ndim == 3 else total.add_(x @ y)
+
+
+def scaled(field: Tensor, beta: float | Tensor) -> Tensor:
+    """Field times beta, without a pass over memory in the usual case."""
+    return field if isinstance(beta, float) and beta == 1.0 else beta * field

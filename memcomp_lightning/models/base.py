@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.models.affine import affine
+from memcomp_lightning.models.affine import affine, scaled
 from memcomp_lightning.models.units.base import Units
 from memcomp_lightning.types import Configurations
 
@@ -60,7 +60,7 @@ class Block(NamedTuple):
     def field(self, x: Float[Tensor, "*replicas n n_units"]) -> Float[Tensor, "*replicas n n_class"]:
         """Field of each unit given all others: the log odds of units in {0, 1}."""
         # To gather values of most units would take longer than to multiply them.
-        return affine(x if self.to_all else x[..., self.neighbours], self.couplings, self.bias)
+        return affine(x if self.to_all else x.index_select(-1, self.neighbours), self.couplings, self.bias)
 
     def draw(self, x: Tensor, beta: float | Tensor, base: Tensor | None, *, generator: Generator) -> None:
         """Draw the units in ``x``, given all others, with the fields of :func:`annealed`."""
@@ -77,7 +77,7 @@ def annealed(
 
     The inverse temperature ``beta`` is a number or ``(..., n, 1)``; no base is one of zeros.
     """
-    field = beta * field
+    field = scaled(field, beta)
     return field if base is None else field + (1 - beta) * base.unsqueeze(-2)
 
 

@@ -204,13 +204,17 @@ class BoltzmannMachine(Machine):
         couplings: Iterable[Tensor] = (
             self._matrix().index_select(-2, order).split(sizes, dim=-2)
             if self._dense
-            else [
-                self._placed((len(units), len(neighbours)), slot, self.coupling[..., edge])
-                for units, neighbours, edge, slot, _ in layouts
-            ]
+            else self._weights_of(layouts)
         )
         parts = zip(layouts, couplings, biases, kinds, strict=True)
         return [Block(layout.units, layout.neighbours, weight, bias, kind) for layout, weight, bias, kind in parts]
+
+    def _weights_of(self, layouts: Sequence[_Layout]) -> list[Tensor]:
+        """Couplings of the units of each class to their neighbours, ``(*replicas, n_class, n_neighbours)``."""
+        return [
+            self._placed((len(units), len(neighbours)), slot, self.coupling.index_select(-1, edge))
+            for units, neighbours, edge, slot, _ in layouts
+        ]
 
     def _matrix(self) -> Tensor:
         """The couplings of all units to all units, ``(*replicas, n_units, n_units)``."""

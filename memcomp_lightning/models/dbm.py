@@ -2,18 +2,21 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require, require_count
+from memcomp_lightning.models.affine import plus_product
 from memcomp_lightning.models.boltzmann import BoltzmannMachine
 from memcomp_lightning.models.connectivity import layered
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.init import Initialiser
 from memcomp_lightning.models.machine import units_of
 from memcomp_lightning.models.units import Units
+from memcomp_lightning.types import Weighted
 
 
 class DBM(BoltzmannMachine):
@@ -79,12 +82,67 @@ class DBM(BoltzmannMachine):
         return "" if pairs is None else super().other_pairs(pairs)
 
     def weights(self) -> list[Float[Tensor, "*replicas n_out n_in"]]:
-        """The couplings of each layer to the one below, as copies."""
-        parts = self.coupling.split([n_in * n_out for n_in, n_out in pairwise(self.sizes)], dim=-1)
+        """The couplings of each layer to the one below, as views."""
+        return [upwards.mT for upwards in self._by_layers(self.coupling)]
+
+    def _by_layers(self, of_pairs: Tensor) -> list[Float[Tensor, "*replicas n_in n_out"]]:
+        """A number for each pair as a matrix for each two layers."""
+        parts = of_pairs.split([n_in * n_out for n_in, n_out in pairwise(self.sizes)], dim=-1)
         return [
-            part.unflatten(-1, (n_in, n_out)).mT
+            part.unflatten(-1, (n_in, n_out))
             for part, (n_in, n_out) in zip(parts, pairwise(self.sizes), strict=True)
         ]
+
+    def _weights_of(self, layouts: Sequence[Any]) -> list[Tensor]:
+        """The even layers have the odd ones for neighbours, and the other way round."""
+        even, odd = (sum(self.sizes[begin::2]) for begin in (0, 1))
+        matrix, row, column = self.coupling.new_zeros(*self.replicas, even, odd), 0, 0
+        for lower, weight in enumerate(self._by_layers(self.coupling)):
+            across = weight.mT if lower % 2 else weight
+            n_rows, n_columns = across.shape[-2:]
+            matrix[..., row : row + n_rows, column : column + n_columns] = across
+            row, column = (row, column + n_columns) if lower % 2 else (row + n_rows, column)
+        return [matrix, matrix.mT]
+
+    def _moments(self, parts: Sequence[Weighted]) -> tuple[Tensor, Tensor]:
+        of_pairs: list[Tensor | None] = [None] * len(self.sizes[1:])
+        of_v = of_h = None
+        for v, h, weight in parts:
+            each = weight.unsqueeze(-2)
+            of_v, of_h = plus_product(of_v, each, v), plus_product(of_h, each, h)
+            below, above = (v, *self.hidden_layers(h)), self.hidden_layers(h * weight.unsqueeze(-1))
+            of_pairs = [plus_product(total, x.mT, y) for total, x, y in zip(of_pairs, below, above, strict=False)]
+        of_units = [total.squeeze(-2) for total in (of_v, of_h) if total is not None]
+        return _joined([product for product in of_pairs if product is not None]), torch.cat(of_units, dim=-1)
+
+    def _own_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        of_pairs, of_units = centred
+        return of_pairs, of_units - self._fields(of_pairs, visible_offset, hidden_offset)
+
+    def _plain_moments(
+        self, centred: Sequence[Tensor], visible_offset: Tensor, hidden_offset: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        of_pairs, of_units = centred
+        of_units = of_units + self._fields(of_pairs, visible_offset, hidden_offset)
+        offsets, units = (visible_offset, *self.hidden_layers(hidden_offset)), of_units.split(self.sizes, dim=-1)
+        plain = [
+            product
+            + offsets[k].unsqueeze(-1) * units[k + 1].unsqueeze(-2)
+            + units[k].unsqueeze(-1) * offsets[k + 1].unsqueeze(-2)
+            for k, product in enumerate(self._by_layers(of_pairs))
+        ]
+        return _joined(plain), of_units
+
+    def _fields(self, of_pairs: Tensor, v: Tensor, h: Tensor) -> Tensor:
+        """Of each unit the sum over its neighbours, of their values times a number of the pair."""
+        x = (v, *self.hidden_layers(h))
+        fields = [torch.zeros_like(layer) for layer in x]
+        for k, numbers in enumerate(self._by_layers(of_pairs)):
+            fields[k] += (numbers @ x[k + 1].unsqueeze(-1)).squeeze(-1)
+            fields[k + 1] += (x[k].unsqueeze(-2) @ numbers).squeeze(-2)
+        return torch.cat(fields, dim=-1)
 
     def hidden_layers(self, h: Float[Tensor, "*axes n_hidden"]) -> tuple[Float[Tensor, "*axes n_layer"], ...]:
         """Split ``h``, which has an entry for each hidden unit, into its layers, the lowest first."""
@@ -131,4 +189,9 @@ class DBM(BoltzmannMachine):
 
 def _flat(weights: Sequence[Tensor]) -> Tensor:
     """Couplings in the order of :func:`layered`."""
-    return torch.cat([weight.mT.flatten(-2) for weight in weights], dim=-1)
+    return _joined([weight.mT for weight in weights])
+
+
+def _joined(upwards: Sequence[Tensor]) -> Tensor:
+    """Matrices of each two layers as a number for each pair."""
+    return torch.cat([matrix.flatten(-2) for matrix in upwards], dim=-1)

@@ -1,5 +1,6 @@
 """Mean-field inference of units that are coupled to each other, with others clamped."""
 
+from collections.abc import Callable
 from itertools import islice
 from typing import Literal, NamedTuple
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.models.affine import affine, plus_product
 from memcomp_lightning.models.base import Block, EnergyModel, Hidden, PerState, Visible
 
 
@@ -69,22 +71,49 @@ def mean_field(
             x[..., block.units] = block.kind.mean(block.field(x))
         change = given.new_zeros(given.shape[:-2])
         return MeanFieldSolution(x[..., free], change, change < tolerance, 1, x[..., :n_visible])
+    # The field of clamped units stays as it is: iterations are of the free ones.
+    places = [_run(block.units) for block in blocks]
+    fields = [_given_clamped(block, x, n_visible, clamped) if fixed is None else block.field for block in blocks]
     change = given.new_full(given.shape[:-1], torch.inf)
     n_iterations = 0
     for n_iterations in range(1, max_iterations + 1):  # noqa: B007
         moves = change >= tolerance
         now = torch.zeros_like(change)
-        for block in blocks:
-            old = x[..., block.units]
+        for block, at, field in zip(blocks, places, fields, strict=True):
+            old = _taken(x, at)
             may_move = moves.unsqueeze(-1) if fixed is None else moves.unsqueeze(-1) & ~fixed[..., block.units]
-            mean = torch.where(may_move, block.kind.mean(block.field(x)), old)
+            mean = torch.where(may_move, block.kind.mean(field(x)), old)
             now = torch.maximum(now, (mean - old).abs().amax(-1))
-            x[..., block.units] = mean
+            x[..., at] = mean
         change = torch.where(moves, now, change)
         if not bool((change >= tolerance).any()):
             break
     largest = change.amax(-1)
     return MeanFieldSolution(x[..., free], largest, largest < tolerance, n_iterations, x[..., :n_visible])
+
+
+def _given_clamped(block: Block, x: Tensor, n_visible: int, clamped: str) -> Callable[[Tensor], Tensor]:
+    """The field of a block as a function of all units, of which those that are clamped keep their values."""
+    moves = _among(block.neighbours, n_visible, clamped)
+    if bool(moves.all()):
+        return block.field
+    parts = []
+    for which in (~moves, moves):
+        at = which.nonzero().flatten()
+        parts.append((_run(block.neighbours[at]), _taken(block.weight, _run(at))))
+    (fixed, of_fixed), (others, of_others) = parts
+    still = affine(_taken(x, fixed), of_fixed, block.bias)
+    return lambda x: plus_product(still.clone(), _taken(x, others), of_others.mT)
+
+
+def _run(at: Tensor) -> Tensor | slice:
+    """Places as a slice, where they follow each other: a view instead of a copy."""
+    first, last = (int(at[0]), int(at[-1])) if len(at) else (0, -1)
+    return slice(first, last + 1) if last - first + 1 == len(at) else at
+
+
+def _taken(x: Tensor, at: Tensor | slice) -> Tensor:
+    return x[..., at] if isinstance(at, slice) else x.index_select(-1, at)
 
 
 def free_energy_of_means(model: EnergyModel, v: Visible, h: Hidden) -> PerState:
@@ -113,7 +142,9 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
     is_free = iter(_among(units, model.n_visible, clamped).tolist())
     for block in blocks:
         places = [place for place, free in enumerate(islice(is_free, block.kind.n)) if free]
-        if places:
+        if len(places) == block.kind.n:
+            found.append(block)
+        elif places:
             keep = torch.tensor(places, device=units.device)
             couplings, bias = block.couplings.index_select(-2, keep), block.bias.index_select(-1, keep)
             found.append(Block(block.units[keep], block.neighbours, couplings, bias, block.kind.select(keep)))

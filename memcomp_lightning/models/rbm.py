@@ -7,7 +7,7 @@ from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.models.affine import affine, plus_product
+from memcomp_lightning.models.affine import affine, plus_product, scaled
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import TwoLayerChains
 from memcomp_lightning.models.init import Initialiser, initial
@@ -219,8 +219,3 @@ class RBM(Machine):
     def forward(self, v: Visible) -> Hidden:
         """The layer as part of a feed-forward network: E[h | v]."""
         return self.hidden_mean(v)
-
-
-def scaled(field: Tensor, beta: float | Tensor) -> Tensor:
-    """Field times beta, without a pass over memory in the usual case."""
-    return field if isinstance(beta, float) and beta == 1.0 else beta * field
