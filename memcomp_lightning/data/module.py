@@ -15,6 +15,7 @@ from memcomp_lightning.data.rows import UNLABELLED, Part, Rows
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
+from memcomp_lightning.types import Batch
 
 if TYPE_CHECKING:
     from memcomp_lightning.data.sequences import SequenceData
@@ -226,6 +227,12 @@ class RowsDataModule(LightningDataModule):
     def test_dataloader(self) -> Batches:
         """Return the test rows, the same for every replica."""
         return self._evaluation_batches(self._test)
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Nothing for batches that are there already; Lightning would look for tensors in each field."""
+        if isinstance(batch, Batch) and batch.v.device == device:
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def train_batches(self, rank: int, world_size: int) -> Batches:
         """Return the shuffled training batches of one of ``world_size`` processes."""

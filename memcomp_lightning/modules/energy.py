@@ -290,33 +290,37 @@ class EnergyPretraining(StageModule):
     @with_gradient()
     def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
+        layer = self.layer
+        phase = self.phases[layer]
+        model = phase.model
         batch = as_batch(batch, self._units)
         with torch.no_grad():
-            v, (positive, inferred) = self.phase.positive_of(batch, self.streams["positive_phase"])
+            v, (positive, inferred) = phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)
         step, generator = self._step(), self.streams["negative_phase"]
         if self._state.sampler is None and self.earlier is not None:
             self._go_on(step, positive.v.shape[-2])
         if self.trainer.world_size > 1:  # the processes add their gradients up in the backward pass
-            gap, negative, self._state = step.contrast(self.model, positive, self._state, generator=generator)
-            loss = step.loss(self.model, gap, batch.share)
+            gap, negative, state = step.contrast(model, positive, self._state, generator=generator)
+            loss = step.loss(model, gap, batch.share)
         else:
-            followed = step.add_gradient(self.model, positive, self._state, share=batch.share, generator=generator)
-            gap, negative, self._state = cast(tuple[Tensor, NegativePhase[object], StepState], followed)
+            followed = step.add_gradient(model, positive, self._state, share=batch.share, generator=generator)
+            gap, negative, state = cast(tuple[Tensor, NegativePhase[object], StepState], followed)
             with torch.no_grad():
-                loss = step.loss(self.model, gap, batch.share)
-        self.update(loss, closes_step=batch.closes_step, optimizer_index=self.layer)
+                loss = step.loss(model, gap, batch.share)
+        self.update(loss, closes_step=batch.closes_step, optimizer_index=layer)
         gap_so_far = self._gap + batch.share * gap.detach()
-        self._gap = gap_so_far
         if batch.closes_step:
-            self.model.project()
-            self.energy_gaps[self.layer] = step.processes.mean(gap_so_far)
-            self._state, self._gap = self._state.after_update(), 0.0
+            model.project()
+            self.energy_gaps[layer] = step.processes.mean(gap_so_far)
+            self._state, self._gap = state.after_update(), 0.0
+        else:
+            self._state, self._gap = state, gap_so_far
         return {
             "loss": loss.detach(),
             "contrast": gap.detach(),
             "v": v,
-            "observed": batch.observed if self.phase.complete is None else None,
+            "observed": batch.observed if phase.complete is None else None,
             "weight": batch.weight,
             "positive": positive,
             "negative": negative.configurations,

@@ -144,6 +144,13 @@ class StageModule(pl.LightningModule):
                     f"({self.stage}.optimizer.lr) and start a new run."
                 )
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """As in any module; at once for what Lightning sets before and after each of its hooks."""
+        if name == "_current_fx_name":
+            object.__setattr__(self, name, value)
+        else:
+            super().__setattr__(name, value)
+
     def backward(self, loss: Tensor, *arguments: Any, **settings: Any) -> None:
         """Nothing for a loss without a graph: its gradient has been added already."""
         if loss.requires_grad:
