@@ -379,7 +379,7 @@ def _passes(config: DictConfig, rows: RowsDataModule) -> int:
     """Passes of pretraining: as many as are typed, or as make up the updates, ten at least."""
     iterations, updates = config.pretrain.iterations, config.pretrain.updates
     if iterations is not None or updates is None:
-        require_count("pretrain.iterations", iterations)
+        require_count("pretrain.iterations", iterations, minimum=0)
         return int(iterations)
     require_count("pretrain.updates", updates)
     return max(FEWEST_PASSES, round(int(updates) / _updates_a_pass(config, rows)))

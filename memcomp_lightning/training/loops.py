@@ -133,7 +133,7 @@ class PhaseTraining:
         self.phase = phase
         self._units = phase.model.visible if phase.visible_of is unchanged else None
         self.step = EnergyStep(sampler=sampler, centring=centring, penalties=penalties)
-        self.schedules = schedules
+        self.schedules: Sequence[Schedule] = schedules
         self.streams = streams
         self.optimizer = optimizer(phase.model.parameters())
         self.passes_done = 0
@@ -152,7 +152,8 @@ class PhaseTraining:
         return found.v if found.weight is None and found.v.shape[-2] > 1 else None
 
     def go_on_with(self, sampler: Sampler, centring: Centring | None) -> None:
-        """Take other settings for the passes that follow; another sampler starts anew."""
+        """Take other settings for the passes that follow, without schedules; another sampler starts anew."""
+        self.schedules = ()
         if sampler != self.step.sampler:
             self._state = self._state._replace(sampler=None)
         self.step = EnergyStep(sampler=sampler, centring=centring, penalties=self.step.penalties)
@@ -202,7 +203,7 @@ class ClassifierTraining:
         dropout: Dropout | None = None,
     ) -> None:
         self.network = network
-        self.schedules = schedules
+        self.schedules: Sequence[Schedule] = schedules
         self.loss = loss
         self.dropout = dropout
         self.optimizer = optimizer(network.parameters())

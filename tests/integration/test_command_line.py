@@ -62,7 +62,7 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
 
 MANY_RUNS = (
     *("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "joint", "annealer"),
-    *("sampler_worth", "joint_likelihood"),
+    *("sampler_worth", "joint_likelihood", "density"),
 )
 """Experiments with tests of their own."""
 

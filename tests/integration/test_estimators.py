@@ -115,7 +115,7 @@ def test_an_rbm_in_a_pipeline_and_a_grid_search():
 def test_likelihoods_rise_with_training():
     train, test, _, _ = digits()
     scores = []
-    for n_iter in (1, 20):
+    for n_iter in (1, 200):
         made = MemcompRBM(12, n_iter=n_iter, random_state=0).fit(train)
         scores.append((made.score(test), made.log_likelihood(test).mean()))
     assert np.all(np.diff(scores, axis=0) > 1.0)
@@ -377,12 +377,12 @@ def test_wrong_weights_are_refused(make, weight, message):
 
 def test_passes_one_by_one_are_those_of_a_fit():
     X, _ = binary()
-    whole, parts = rbm(n_iter=4, batch_size=7).fit(X), rbm(batch_size=7)
+    whole, parts = rbm(n_iter=4, batch_size=7, last_rate=1.0).fit(X), rbm(batch_size=7)
     for _ in range(4):
         parts.partial_fit(X)
     np.testing.assert_array_equal(parts.components_, whole.components_)
     assert parts.n_iter_ == whole.n_iter_ == 4
-    further, longer = rbm(n_iter=3, batch_size=7).fit(X).partial_fit(X), whole
+    further, longer = rbm(n_iter=3, batch_size=7, last_rate=1.0).fit(X).partial_fit(X), whole
     np.testing.assert_array_equal(further.components_, longer.components_)
 
 
@@ -633,6 +633,8 @@ def test_the_number_of_features_out_is_the_fitted_one():
         (MemcompRBM(n_components=0), "n_components = 0"),
         (MemcompRBM(learning_rate=-1.0), "learning_rate = -1.0"),
         (MemcompRBM(batch_size=0), "batch_size = 0"),
+        (MemcompRBM(last_rate=0.0), "last_rate = 0.0"),
+        (MemcompRBM(n_iter=0), "n_iter = 0"),
         (MemcompRBM(early_stopping=True, validation_fraction=1.0), "validation_fraction = 1.0"),
         (MemcompRBM(sampler="pcd"), "sampler = 'pcd'"),
         (MemcompDBNClassifier(pretrain="all"), "pretrain = 'all'"),
@@ -652,11 +654,16 @@ def test_wrong_settings_are_refused(estimator, message):
 def test_the_command_line_trains_by_the_same_defaults():
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
         config = compose("config", overrides=["sampler=pcd"])
+        of_table = compose("config", overrides=["data=table"])
     signature = {name: p.default for name, p in inspect.signature(MemcompRBM).parameters.items()}
-    pretrain = config.pretrain
+    pretrain = of_table.pretrain
     assert pretrain.batch_size == signature["batch_size"]
     assert pretrain.optimizer.lr == signature["learning_rate"]
     assert pretrain.iterations == signature["n_iter"]
+    assert pretrain.updates == defaults.TABLE_UPDATES
+    assert pretrain.schedules.decay.final == signature["last_rate"]
+    assert of_table.model.hidden_sizes == [signature["n_components"]]
+    pretrain = config.pretrain
     assert pretrain.initial_bias == "data"
     assert pretrain.centring.rate == defaults.CENTRING_RATE
     assert config.sampler.n_chains == defaults.N_CHAINS

@@ -39,7 +39,7 @@ from memcomp_lightning.samplers import (
 )
 from memcomp_lightning.solvers import AlternatingDescent, BruteForce
 from memcomp_lightning.testing import check_sampler
-from memcomp_lightning.training import Boltzmann, pretrain
+from memcomp_lightning.training import Boltzmann, LearningRateDecay, pretrain
 
 Run = Callable[..., Outcome]
 
@@ -114,7 +114,9 @@ def test_learns_the_maximum_of_the_likelihood() -> None:
     """There pairs of units are on together as often as in the data (Ackley, Hinton & Sejnowski 1985)."""
     model, data = BoltzmannMachine(9, 0), bars()
     optimizer = partial(torch.optim.Adam, lr=0.1)
-    for _ in pretrain(Boltzmann(model), data.train_batches(0, 1), Exact(), iterations=300, optimizer=optimizer):
+    stage, falls = Boltzmann(model), [LearningRateDecay(600)]  # Adam would go on to swing about the maximum
+    batches = data.train_batches(0, 1)
+    for _ in pretrain(stage, batches, Exact(), iterations=600, optimizer=optimizer, schedules=falls):
         pass
     v = data.images.train_v
     states = binary_states(9, like=v)
