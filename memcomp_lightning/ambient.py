@@ -15,8 +15,6 @@ import torch
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_KINDS = ("cpu", "cuda")
-
 
 @contextmanager
 def with_gradient() -> Iterator[None]:
@@ -52,7 +50,7 @@ def in_own_dtypes(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _autocasts() -> bool:
-    return any(torch.is_autocast_enabled(kind) for kind in _KINDS)
+    return torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")
 
 
 @contextmanager

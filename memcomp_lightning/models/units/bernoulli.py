@@ -27,7 +27,7 @@ class Bernoulli(Units):
 
     def sample_of_mean(self, mean: Values, *, generator: Generator) -> Values:
         """Draw 0 or 1; the mean is the probability of 1."""
-        return rng.bernoulli(mean, generator=generator)
+        return rng.uniform(mean.shape, generator=generator, like=mean).lt_(mean)
 
     def mode(self, field: Values) -> Values:
         """1 where the field is positive."""
