@@ -10,12 +10,14 @@ from memcomp_lightning.likelihood.exact import (
     log_likelihood_or_bound,
     log_partition_function,
 )
+from memcomp_lightning.likelihood.generative import RecognitionBound, recognition_bound
 from memcomp_lightning.likelihood.pseudo import log_pseudo_likelihood
 
 __all__ = [
     "Ais",
     "AisEstimate",
     "BothWays",
+    "RecognitionBound",
     "ReverseAis",
     "annealing_products",
     "base_of",
@@ -28,4 +30,5 @@ __all__ = [
     "log_likelihood_or_bound",
     "log_partition_function",
     "log_pseudo_likelihood",
+    "recognition_bound",
 ]

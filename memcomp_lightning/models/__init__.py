@@ -8,6 +8,7 @@ from memcomp_lightning.models.dbm import DBM
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.feedforward import BatchNorm, BatchNormReluNetwork, Linear, with_batch_norm_relu
 from memcomp_lightning.models.gauge import zero_sum
+from memcomp_lightning.models.generative import GenerativeDBN
 from memcomp_lightning.models.init import Initialiser, Normal, Uniform, Xavier, independent_bias, start_at_means
 from memcomp_lightning.models.mean_field import MeanFieldSolution, hidden_blocks, mean_field
 from memcomp_lightning.models.parts import energy_models, joint_model
@@ -28,6 +29,7 @@ __all__ = [
     "Couplings",
     "EnergyModel",
     "GaussianMoments",
+    "GenerativeDBN",
     "Initialiser",
     "Linear",
     "MeanFieldSolution",

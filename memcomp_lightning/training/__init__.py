@@ -19,6 +19,7 @@ from memcomp_lightning.training.schedules import (
 from memcomp_lightning.training.score import Score, evaluate, score
 from memcomp_lightning.training.stages import Boltzmann, Greedy, Joint, Phase, PretrainingStage
 from memcomp_lightning.training.step import EnergyStep, Processes, Sampler, StepState
+from memcomp_lightning.training.updown import UpDownLosses, UpDownStep, up_down
 
 __all__ = [
     "FINETUNING_SGD",
@@ -53,6 +54,8 @@ __all__ = [
     "Schedule",
     "Score",
     "StepState",
+    "UpDownLosses",
+    "UpDownStep",
     "balanced",
     "cross_entropy",
     "diverged_parameter",
@@ -64,4 +67,5 @@ __all__ = [
     "score",
     "squared_error",
     "state_of",
+    "up_down",
 ]
