@@ -36,15 +36,16 @@ from memcomp_lightning.configuration.values import check_values, require_held_ou
 from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout, RowsDataModule, TableDataModule
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
-from memcomp_lightning.models import DBN, energy_models, start_at_means
+from memcomp_lightning.models import DBN, GenerativeDBN, energy_models, start_at_means
 from memcomp_lightning.models.units import Units
-from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining
+from memcomp_lightning.modules import Classifier, DBNClassifier, EnergyPretraining, UpDown
 from memcomp_lightning.modules.trainers import PRECISIONS, check_bare_loop, check_callback, precision_of
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import ModeAssisted
+from memcomp_lightning.samplers.base import require_state
 from memcomp_lightning.studies.plan import Plan, Stage
-from memcomp_lightning.training import OptimizerFactory, Penalty, Schedule, balanced
+from memcomp_lightning.training import EnergyStep, OptimizerFactory, Penalty, Schedule, UpDownStep, balanced
 from memcomp_lightning.training.schedules import check_schedules
 from memcomp_lightning.training.score import FILL_IN, NO_GAPS
 
@@ -57,7 +58,17 @@ log = logging.getLogger(__name__)
 
 _STAGE_SETTINGS = ("iterations", "batch_size", "optimizer", "schedules")
 _OF_MODELS = ("data", "units", "model", "solver", "sampler", "positive")
-_OF_TRAINING = ("pretrain", "finetune", "trainer", "logger", "callbacks", "seed", "checkpoint_every", "continue")
+_OF_TRAINING = (
+    "pretrain",
+    "updown",
+    "finetune",
+    "trainer",
+    "logger",
+    "callbacks",
+    "seed",
+    "checkpoint_every",
+    "continue",
+)
 _DEALT = ("partitions", "first_partitions", "validation_fraction", "chunk_size")
 _STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
@@ -74,7 +85,8 @@ _SETTINGS = {
         "patience",
     ),
     "finetune": (*_STAGE_SETTINGS, "loss", "units", "labels", "class_weights", "dropout", *_STOPPING),
-    "callbacks": ("pretrain", "finetune"),
+    "updown": (*_STAGE_SETTINGS, "labels", "visible", "sampler"),
+    "callbacks": ("pretrain", "updown", "finetune"),
 }
 """What is read here, by group, so that ``+group.name=value`` cannot add what nobody reads."""
 
@@ -150,6 +162,7 @@ def build(config: DictConfig) -> Plan:
             earlier=None if earlier is None else earlier.chains(),
         )
         pretraining = Stage(module, rows, callbacks)
+    updown = _updown(config, network, data, units)
     labels = config.finetune.labels
     require(labels is None or data.n_classes > 0, "finetune.labels", labels, "null for data without labels")
     if config.finetune.iterations > 0 and data.n_classes:
@@ -168,10 +181,36 @@ def build(config: DictConfig) -> Plan:
             earlier.give(classifier.network)
         finetuning = Stage(classifier, rows, callbacks)
     between = _part(config.between_stages, "between_stages") if isinstance(network, DBN) else None
-    plan = Plan(network, pretraining, finetuning, between, stage_for)
+    plan = Plan(network, pretraining, finetuning, between, stage_for, updown)
     allowed = "an integer >= 1 where there is no pretraining"
     require(bool(plan.stages), "finetune.iterations", config.finetune.iterations, allowed)
     return plan
+
+
+def _updown(config: DictConfig, network: nn.Module, data: "Data", units: Units) -> Stage | None:
+    """The training of a DBN as a generative model; None where it is left out."""
+    settings = config.updown
+    require_count("updown.iterations", settings.iterations, minimum=0)
+    if settings.iterations == 0:
+        return None
+    require(isinstance(network, DBN), "updown.iterations", settings.iterations, "0 for what is no DBN")
+    labels, classes = settings.labels, data.n_classes
+    require(isinstance(labels, bool), "updown.labels", labels, "true or false")
+    require(classes > 0 or not labels, "updown.labels", labels, "false for data without labels")
+    rows = _data(config, "updown", data, units)
+    require(not rows.has_gaps, "missing values", "in the data of up-down training", "none", FILL_IN)
+    step = UpDownStep(top=EnergyStep(sampler=instantiate(settings.sampler)), visible=settings.visible)
+    schedules = _schedules(config, "updown", settings.iterations)
+    module = UpDown(
+        GenerativeDBN(cast(DBN, network), n_classes=classes if labels else 0),
+        step=step,
+        iterations=settings.iterations,
+        optimizer=_optimizer(config, "updown", schedules),
+        schedules=schedules,
+        seed=config.seed,
+    )
+    require_state(step.top.sampler.init(module.network.top, 1, generator=rng.stream(config.seed, "check")))
+    return Stage(module, rows, _callbacks(config, "updown"))
 
 
 def classifier_of(
@@ -418,12 +457,14 @@ def _sampler(config: DictConfig, data: RowsDataModule, iterations: int) -> Any:
 
 
 def _data(config: DictConfig, stage: str, data: "Data", units: Units) -> RowsDataModule:
-    """Batches of a stage: fine-tuning takes the rows that have a label, or as many as it is told."""
+    """Batches of a stage: what learns labels takes the rows that have one, fine-tuning as many as it is told."""
     settings = {name: config.data[name] for name in _DEALT}
     if settings["validation_fraction"] is None:
         alone = isinstance(data, ImageData) or data.validation is not None or data.train.n < FEWEST_TO_HOLD_OUT
         settings["validation_fraction"] = 0.0 if alone or not config.pretrain.keep_best else HELD_OUT
     settings |= {"batch_size": config[stage].batch_size, "seed": config.seed}
+    if stage == "updown" and config.updown.labels:
+        settings["labels"] = "all"
     if stage == "finetune":
         settings["labels"] = "all" if config.finetune.labels is None else config.finetune.labels
     try:

@@ -85,6 +85,7 @@ def run(
                 folder.finish_stage(name, records[name])
         if stage is plan.pretraining:
             plan.fill_gaps(seed)
+            plan.unfold()
             plan.change_between_stages(seed)
     result: dict[str, Any] = {"overrides": dict(overrides), "seed": seed, "stages": records}
     if folder.history:

@@ -74,7 +74,9 @@ def run_table(result: dict[str, Any]) -> str:
         for layer, (trained, n, gap) in enumerate(zip(record.get("trained", []), passes, gaps, strict=False)):
             nats = with_error(likelihoods[layer], digits=2) if likelihoods[layer] else ""
             rows.append([f"{name} {trained}", n, with_error(gap), nats, "", ""])
-        if not gaps:
+        if name == "updown":
+            rows.append([name, passes[0], "", "", "", ""])
+        elif not gaps:
             learnt_from = f", {result['labels']:,} labels" if "labels" in result else ""
             accuracy = with_error(result["test_accuracy"])
             rows.append([f"{name}{learnt_from}", passes[0], "", "", accuracy, ""])

@@ -12,7 +12,7 @@ from memcomp_lightning.callbacks import BestWeights
 from memcomp_lightning.data import ImageDataModule, RowsDataModule
 from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, Randomiser
-from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule
+from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule, UpDown
 from memcomp_lightning.studies.records import Named
 from memcomp_lightning.training import Batches, Pass, PretrainingStage, finetune, pretrain
 from memcomp_lightning.training.filling import Filling
@@ -105,6 +105,7 @@ class Plan:
         finetuning: The last stage, None if left out.
         between: Changes the network after its pretraining, None if nothing does.
         stage_for: The way of pretraining for another network of the same kind; None without pretraining.
+        updown: The training of a copy of the pretrained network as a generative model, None if left out.
     """
 
     network: nn.Module
@@ -112,6 +113,7 @@ class Plan:
     finetuning: Stage | None
     between: Randomiser | None = None
     stage_for: Callable[[Any], PretrainingStage] | None = None
+    updown: Stage | None = None
 
     def fill_gaps(self, seed: int) -> None:
         """Let the pretrained model, as it is now, draw what is missing of the inputs of fine-tuning."""
@@ -119,6 +121,11 @@ class Plan:
             return
         _, module = finetuning_of(self)
         module.fill_by(Filling(self.stage_for(self.network).phases[0].model, seed=seed))
+
+    def unfold(self) -> None:
+        """Let the generative model begin with the network's weights, as they are now."""
+        if self.updown is not None and isinstance(self.network, DBN):
+            cast(UpDown, self.updown.module).network.take(self.network)
 
     def change_between_stages(self, seed: int) -> None:
         """Apply ``between`` to a pretrained DBN before it is fine-tuned; the same seed does the same."""
@@ -133,7 +140,7 @@ class Plan:
     @property
     def stages(self) -> list[Stage]:
         """The stages in order."""
-        return [stage for stage in (self.pretraining, self.finetuning) if stage is not None]
+        return [stage for stage in (self.pretraining, self.updown, self.finetuning) if stage is not None]
 
 
 @dataclass(frozen=True, kw_only=True)
