@@ -2,6 +2,7 @@
 
 from memcomp_lightning.trained.alone import LoadWarning
 from memcomp_lightning.trained.features import transform
+from memcomp_lightning.trained.generative import load_generative
 from memcomp_lightning.trained.imputation import Imputation, impute
 from memcomp_lightning.trained.run import Run, load
 from memcomp_lightning.trained.sampling import Samples, sample
@@ -15,6 +16,7 @@ __all__ = [
     "Scores",
     "impute",
     "load",
+    "load_generative",
     "sample",
     "score",
     "transform",
