@@ -30,13 +30,8 @@ def composing() -> AbstractContextManager[None]:
 
 
 def study_of(config: DictConfig) -> str | None:
-    """The setting of many runs that an experiment has filled; None in a single run.
-
-    A preset fills parts of several: the study is the one with a name. Without one it is the first that is filled.
-    """
-    filled = [name for name in STUDIES if config.get(name) is not None]
-    named = [name for name in filled if {"name", "all"} & set(config[name])]
-    return next(iter([*named, *filled]), None)
+    """The setting of many runs that an experiment has filled; None in a single run."""
+    return next((name for name in STUDIES if config.get(name) is not None), None)
 
 
 def search_paths(overrides: Iterable[str]) -> list[str]:
