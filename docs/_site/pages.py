@@ -59,11 +59,13 @@ GROUP_TEXTS = {
     "positive": "What supplies the hidden units given the data where they are coupled to each other.",
     "preset": "Settings of all groups at once: those of the paper, or those of a figure in a minute or two.",
     "preset/figure": "What a preset does to a figure.",
+    "preset/study": "What a preset does to an experiment of one run.",
     "pretrain": "Pretraining: rate, updates, which layers at once.",
     "sampler": "What supplies the negative phase; [where each one sits](../concepts.md).",
     "solver": "What looks for ground states of the QUBO, of the samplers that need one and of `memcomp-solve`.",
     "solver/field": "The equations of the DMM; [the DMM](../dmm.md).",
     "trainer": "Lightning's trainer.",
+    "updown": "Training of the pretrained network as a generative model.",
     "units": "What the visible units are, and how grey values become their values; [units](../units.md).",
     "worth": "Comparisons by likelihood; the experiments of that name choose them.",
 }

@@ -62,8 +62,9 @@ def main() -> None:
     labels = torch.arange(model.n_classes).repeat_interleave(model.n_classes)
     samples = model.samples(len(labels), sweeps=given.sweeps, label=labels, generator=rng.stream(SEED, "samples"))
     picture = given.picture or given.run / "samples.png"
-    side = round(samples.shape[-1] ** 0.5)
-    imsave(picture, picture_grid(samples.unflatten(-1, (side, side)).numpy()), cmap="gray", vmin=0, vmax=1)
+    layout = rows.pixel_layout
+    assert layout is not None, "the data are no pictures"
+    imsave(picture, picture_grid(layout.to_picture(samples).numpy()), cmap="gray", vmin=0, vmax=1)
     print(f"samples, a class a row: {picture}")
 
 

@@ -32,8 +32,7 @@ def recognition_bound(
 ) -> RecognitionBound:
     r"""Return a lower bound of log p(v) of each row.
 
-    .. math:: \log p(v) \ge E_q[\log p(v, h)] + H(q)
-              = E_q[\log p(v | h_1) + \ldots + \log p(h_{L-1}) - \log q(h | v)]
+    .. math:: \log p(v) \ge E_q[\log p(v, h)] + H(q) = E_q[\log p(v, h) - \log q(h | v)]
 
     with the hidden units of the top RBM, and its labels, summed out (Salakhutdinov & Murray 2008). The average
     over draws has the bound as its mean; where q is the true posterior every draw is log p(v). A ``log_z`` from
