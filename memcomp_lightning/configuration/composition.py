@@ -17,7 +17,7 @@ CONFIG_MODULE = "memcomp_lightning.conf"
 SEARCH_PATH = "hydra.searchpath="
 """Begins the override that says where else groups are looked for."""
 
-STUDIES = ("worth", "density", "figure")
+STUDIES = ("worth", "density", "few_labels", "figure")
 """Settings that an experiment of many runs fills, each with a study of its own; null in a single run."""
 
 _OF_MANY_RUNS = ("hydra.", *(f"{name}{mark}" for name in STUDIES for mark in "./"))

@@ -19,8 +19,8 @@ from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.files import write_json
 from memcomp_lightning.studies import Record, Records, runner
 from memcomp_lightning.studies.density import Density, DensityTrial, Peer, PeerTrial, peers_of
-from memcomp_lightning.studies.density.search import Setting, best_of, missing, text_of
 from memcomp_lightning.studies.plan import pretraining_of
+from memcomp_lightning.studies.search import Setting, best_of, missing, text_of
 
 CHOOSES = 1000
 """The seed by which settings are chosen; those that are reported count from 0."""

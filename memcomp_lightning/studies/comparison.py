@@ -50,6 +50,11 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     return Comparison(effect, effect - half, effect + half, p, n)
 
 
+def accounts_for(control: ArrayLike, better: ArrayLike, gain: Comparison) -> bool:
+    """Whether a control explains more than half of a gain of ``better``, with all of its 95 % interval."""
+    return compare(better, control).high < gain.effect / 2
+
+
 def signed(value: float) -> str:
     """A difference of accuracies: three digits, its sign, no zero before the point.
 

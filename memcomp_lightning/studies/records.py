@@ -12,7 +12,7 @@ from memcomp_lightning.errors import require
 from memcomp_lightning.files import write_text
 
 Measures = dict[str, list[list[float]]]
-Key = tuple[str, str, float | None, str, int | None, int | None, bool]
+Key = tuple[str, str, float | None, str, int | None, int | None, bool, int | None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,7 @@ class Named:
         iterations: Pretraining iterations N of each layer; None where the method says how many.
         seed: Of weights, chains and order; None where each replica has its own.
         choosing: Whether the trial only serves the choice: held-out data then judge it.
+        labels: How many rows have a label; None where the data set says how many.
     """
 
     method: str
@@ -36,11 +37,13 @@ class Named:
     iterations: int | None = None
     seed: int | None = None
     choosing: bool = False
+    labels: int | None = None
 
     @property
     def key(self) -> Key:
         """All of it."""
-        return self.data_set, self.method, self.value, self.setting, self.iterations, self.seed, self.choosing
+        chosen = self.value, self.setting, self.iterations
+        return self.data_set, self.method, *chosen, self.seed, self.choosing, self.labels
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,14 @@ from memcomp_lightning.studies.density import read_densities
 from memcomp_lightning.studies.density.events import write_events as density_events
 from memcomp_lightning.studies.density.plot import density_figures
 from memcomp_lightning.studies.density.results import DENSITY_RULE, density_table, density_verdicts
+from memcomp_lightning.studies.few_labels import read_few_labels
+from memcomp_lightning.studies.few_labels.plot import few_labels_figures
+from memcomp_lightning.studies.few_labels.results import (
+    FEW_LABELS_RULE,
+    few_labels_table,
+    few_labels_verdicts,
+    worth_note,
+)
 from memcomp_lightning.studies.page import Section, markdown
 from memcomp_lightning.studies.plot_accuracy import accuracy_figures
 from memcomp_lightning.studies.plot_worth import plot_worth
@@ -51,6 +59,13 @@ def write_report(folder: Path) -> Section:
         figures, numbers = density_figures(densities), as_csv(density_table(densities))
         judged = density_verdicts(densities)
         density_events(densities, folder / "tensorboard")
+    elif (folder / "few_labels.json").exists():
+        accuracies = read_few_labels(folder)
+        _check_measured(folder, bool(accuracies.labels))
+        name, title, rule = accuracies.plan.name, accuracies.plan.title, FEW_LABELS_RULE
+        figures, numbers = few_labels_figures(accuracies), as_csv(few_labels_table(accuracies))
+        judged = few_labels_verdicts(accuracies)
+        notes.append(worth_note(accuracies))
     else:
         results = read_results(folder)
         _check_measured(folder, bool(results.curves))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from memcomp_lightning.studies.comparison import Comparison, compare
+from memcomp_lightning.studies.comparison import Comparison, accounts_for, compare
 from memcomp_lightning.studies.results import Claim, Results
 
 HOLDS, FAILS, ONLY = "holds", "does not hold", "holds only without controls"
@@ -140,7 +140,7 @@ def explaining(results: Results, claim: Claim, passes: int, gain: Comparison) ->
     """Controls that account for more than half of a gain."""
     best = _at_last(results, claim.better, passes)
     measured = [curve for curve in results.plan.controls(claim) if curve in results.curves]
-    return [c for c in measured if compare(best, _at_last(results, c, passes)).high < gain.effect / 2]
+    return [c for c in measured if accounts_for(_at_last(results, c, passes), best, gain)]
 
 
 def _verdict(results: Results, holds: bool, controls: list[str]) -> tuple[str, tuple[str, ...]]:

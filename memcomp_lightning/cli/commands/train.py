@@ -24,7 +24,7 @@ from memcomp_lightning.cli.continued import with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
 from memcomp_lightning.cli.search import check_searchable
-from memcomp_lightning.configuration import comparisons, densities, figures, trajectory
+from memcomp_lightning.configuration import comparisons, densities, few_labels, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
 from memcomp_lightning.configuration.composition import CONFIG_MODULE, study_of
 from memcomp_lightning.configuration.continued import earlier_of
@@ -42,7 +42,7 @@ from memcomp_lightning.training import DivergedError
 
 COMMAND = "memcomp-train"
 
-_ALONE = {"worth": comparisons, "density": densities}
+_ALONE = {"worth": comparisons, "density": densities, "few_labels": few_labels}
 """What checks and trains a study that is no figure, by its setting."""
 
 log = logging.getLogger(__name__)

@@ -24,9 +24,9 @@ import torch
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.interop.parameters import rbm_of, tensor_of
 from memcomp_lightning.studies.accuracy import Progress
-from memcomp_lightning.studies.density.search import Axes, Setting, checked_start
 from memcomp_lightning.studies.density.trial import scores_of
 from memcomp_lightning.studies.records import Named, Record
+from memcomp_lightning.studies.search import Axes, Setting, checked_start
 
 
 @dataclass(frozen=True, kw_only=True)

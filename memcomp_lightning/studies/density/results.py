@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from memcomp_lightning.studies.density.peers import Peer
-from memcomp_lightning.studies.density.search import Setting
 from memcomp_lightning.studies.density.settings import Density, Model
 from memcomp_lightning.studies.records import Record, Records
+from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
 from memcomp_lightning.studies.worth import holm
 

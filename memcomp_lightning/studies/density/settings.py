@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from memcomp_lightning.errors import require, require_count, require_some
-from memcomp_lightning.studies.density.search import Axes, Setting, checked_start
+from memcomp_lightning.studies.search import Axes, Setting, checked_start
 
 
 @dataclass(frozen=True, kw_only=True)

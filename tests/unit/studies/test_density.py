@@ -14,9 +14,9 @@ from memcomp_lightning.models import RBM
 from memcomp_lightning.studies.density import Densities, Density, Model, Peer, PeerTrial, peers_of
 from memcomp_lightning.studies.density.plot import density_figures
 from memcomp_lightning.studies.density.results import density_table, density_verdicts
-from memcomp_lightning.studies.density.search import best_of, checked_start, missing, text_of
 from memcomp_lightning.studies.density.trial import scores_of
 from memcomp_lightning.studies.records import Record
+from memcomp_lightning.studies.search import best_of, checked_start, missing, text_of
 
 PROGRAM = """
 import json, pathlib, sys
