@@ -111,7 +111,8 @@ class SupportVectors(Classical):
         """A new one, not fitted."""
         from sklearn.svm import SVC
 
-        return SVC(C=setting["C"], gamma=setting["gamma"] / max(x.shape[1] * float(x.var()), 1e-12))
+        gamma = setting["gamma"] / max(x.shape[1] * float(x.var()), 1e-12)
+        return SVC(C=setting["C"], gamma=gamma, random_state=0)
 
 
 def _spread(label: Tensor, most: int | None) -> Tensor:
