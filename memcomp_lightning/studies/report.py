@@ -3,7 +3,9 @@
 import io
 import json
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
@@ -25,7 +27,7 @@ from memcomp_lightning.studies.page import Section, markdown
 from memcomp_lightning.studies.plot_accuracy import accuracy_figures
 from memcomp_lightning.studies.plot_worth import plot_worth
 from memcomp_lightning.studies.results import read_results
-from memcomp_lightning.studies.verdicts import RULE, verdicts
+from memcomp_lightning.studies.verdicts import RULE, Verdict, verdicts
 from memcomp_lightning.studies.worth import WORTH_RULE, read_worth, worth_table, worth_verdicts
 from memcomp_lightning.studies.worth_report import write_event_file, write_events
 
@@ -45,39 +47,61 @@ def write_report(folder: Path) -> Section:
     if origin.exists():
         made_by = json.loads(origin.read_text(encoding="utf-8"))
         notes.append(", ".join(f"{key} {value}" for key, value in made_by.items()))
-    if (folder / "worth.json").exists():
-        worth = read_worth(folder)
-        _check_measured(folder, bool(worth.data_sets))
-        name, title, rule = "sampler_worth", worth.plan.title, WORTH_RULE
-        figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
-        numbers, judged = as_csv(worth_table(worth)), worth_verdicts(worth)
-        write_events(worth, folder / "tensorboard")
-    elif (folder / "density.json").exists():
-        densities = read_densities(folder)
-        _check_measured(folder, bool(densities.tables))
-        name, title, rule = densities.plan.name, densities.plan.title, DENSITY_RULE
-        figures, numbers = density_figures(densities), as_csv(density_table(densities))
-        judged = density_verdicts(densities)
-        density_events(densities, folder / "tensorboard")
-    elif (folder / "few_labels.json").exists():
-        accuracies = read_few_labels(folder)
-        _check_measured(folder, bool(accuracies.labels))
-        name, title, rule = accuracies.plan.name, accuracies.plan.title, FEW_LABELS_RULE
-        figures, numbers = few_labels_figures(accuracies), as_csv(few_labels_table(accuracies))
-        judged = few_labels_verdicts(accuracies)
-        notes.append(worth_note(accuracies))
-    else:
-        results = read_results(folder)
-        _check_measured(folder, bool(results.curves))
-        plan, rule = results.plan, RULE
-        name, title = plan.name, f"{plan.name}: {plan.data}, {plan.title}"
-        figures = accuracy_figures(results)
-        numbers, judged = results.table(), verdicts(results)
-        notes.append(f"Training took {results.seconds / 60:.1f} min of one core.")
-    write_text(folder / f"{name}.csv", numbers)
-    write_text(folder / "verdicts.md", markdown(judged))
-    pictures = [(caption, save(folder, caption, figure)) for caption, figure in figures.items()]
-    return Section(title, pictures, judged, [*notes, f"Numbers: {name}.csv"], rule)
+    shown = next((show for file, show in _BY_FILE.items() if (folder / file).exists()), _of_figure)(folder)
+    write_text(folder / f"{shown.name}.csv", shown.numbers)
+    write_text(folder / "verdicts.md", markdown(shown.verdicts))
+    pictures = [(caption, save(folder, caption, figure)) for caption, figure in shown.figures.items()]
+    notes += [*shown.notes, f"Numbers: {shown.name}.csv"]
+    return Section(shown.title, pictures, shown.verdicts, notes, shown.rule)
+
+
+class _Shown(NamedTuple):
+    """What a study shows: figures by caption, numbers as CSV, verdicts and how they are made."""
+
+    name: str
+    title: str
+    rule: str
+    figures: Mapping[str, Figure]
+    numbers: str
+    verdicts: Sequence[Verdict]
+    notes: Sequence[str] = ()
+
+
+def _of_worth(folder: Path) -> _Shown:
+    worth = read_worth(folder)
+    _check_measured(folder, bool(worth.data_sets))
+    write_events(worth, folder / "tensorboard")
+    figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
+    numbers = as_csv(worth_table(worth))
+    return _Shown("sampler_worth", worth.plan.title, WORTH_RULE, figures, numbers, worth_verdicts(worth))
+
+
+def _of_density(folder: Path) -> _Shown:
+    found = read_densities(folder)
+    _check_measured(folder, bool(found.tables))
+    density_events(found, folder / "tensorboard")
+    plan, numbers = found.plan, as_csv(density_table(found))
+    return _Shown(plan.name, plan.title, DENSITY_RULE, density_figures(found), numbers, density_verdicts(found))
+
+
+def _of_few_labels(folder: Path) -> _Shown:
+    found = read_few_labels(folder)
+    _check_measured(folder, bool(found.labels))
+    plan, numbers, judged = found.plan, as_csv(few_labels_table(found)), few_labels_verdicts(found)
+    figures, notes = few_labels_figures(found), [worth_note(found)]
+    return _Shown(plan.name, plan.title, FEW_LABELS_RULE, figures, numbers, judged, notes)
+
+
+def _of_figure(folder: Path) -> _Shown:
+    results = read_results(folder)
+    _check_measured(folder, bool(results.curves))
+    plan, notes = results.plan, [f"Training took {results.seconds / 60:.1f} min of one core."]
+    title, figures = f"{plan.name}: {plan.data}, {plan.title}", accuracy_figures(results)
+    return _Shown(plan.name, title, RULE, figures, results.table(), verdicts(results), notes)
+
+
+_BY_FILE = {"worth.json": _of_worth, "density.json": _of_density, "few_labels.json": _of_few_labels}
+"""By the file in which a study keeps its settings; figures are the others."""
 
 
 def _check_measured(folder: Path, measured: bool) -> None:
