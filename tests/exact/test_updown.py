@@ -300,6 +300,9 @@ def test_a_confident_recognition_model_is_a_classifier():
 @pytest.mark.parametrize("label", [None, 0, 1])
 def test_samples_of_a_class_are_those_of_the_joint_distribution(label):
     model, n = model_of(2), 20_000
+    # Classes that differ: each hidden unit likes one of them.
+    model.top.weight.data[:] = torch.tensor([[2.0, 1, -2, 2, -2], [-2, 1, 2, -2, 2]])
+    model.top.b.data[:] = torch.tensor([0, -1.0, 0, 0, 0.3])
     fixed = None if label is None else torch.full((n,), label)
     v = model.samples(n, sweeps=60, label=fixed, visible="sample", generator=rng.stream(0, "samples"))
     states, log_p = joint(model)
