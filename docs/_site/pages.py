@@ -52,6 +52,7 @@ GROUP_TEXTS = {
     "experiment": "Named combinations of settings: figures, comparisons.",
     "figure": "Curves, sizes and claims of a figure; the experiments of that name choose them.",
     "figure/curves": "Curves that a figure adds to its own.",
+    "few_labels": "A study of few labels; `experiment=few_labels` chooses it.",
     "finetune": "Back-propagation after pretraining.",
     "hparams": "Searches for good settings, a multirun; [sweeps](../sweeps.md).",
     "logger": "Where numbers and pictures go.",
@@ -59,7 +60,11 @@ GROUP_TEXTS = {
     "positive": "What supplies the hidden units given the data where they are coupled to each other.",
     "preset": "Settings of all groups at once: those of the paper, or those of a figure in a minute or two.",
     "preset/figure": "What a preset does to a figure.",
+<<<<<<< HEAD
     "preset/study": "What a preset does to an experiment of one run.",
+=======
+    "preset/study": "What a preset does to a study that is no figure.",
+>>>>>>> 02f966f (Docs: the groups few_labels and preset/study say how they are chosen)
     "pretrain": "Pretraining: rate, updates, which layers at once.",
     "sampler": "What supplies the negative phase; [where each one sits](../concepts.md).",
     "solver": "What looks for ground states of the QUBO, of the samplers that need one and of `memcomp-solve`.",
@@ -264,6 +269,8 @@ SET_BY = {
     "figure/curves": "`figure/curves={option}`, beside an `experiment` that is a figure",
     "worth": "an `experiment` sets it: `experiment=sampler_worth` or `experiment=joint_likelihood`",
     "preset/figure": "`preset={option}`, beside an `experiment` that is a figure",
+    "preset/study": "by an experiment and a preset: `experiment=few_labels preset=quick`",
+    "few_labels": "an `experiment` sets it: `experiment={option}`",
     "hparams": "`-m hparams={option}`",
 }
 """Groups that are not chosen by their name alone."""

@@ -38,6 +38,8 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
     require_choice("trainer.accelerator", config.trainer.accelerator, ("auto", "cpu"))
     _check_data(study, build(OmegaConf.create(_settings(study, overrides))))
     for trial in _pretrainings(study, overrides, Path()):
+        if trial.seed:
+            continue  # as the first one
         own = OmegaConf.create(trial.settings)
         plan = build(own)
         check_without_trainer(plan, own)
