@@ -60,11 +60,7 @@ GROUP_TEXTS = {
     "positive": "What supplies the hidden units given the data where they are coupled to each other.",
     "preset": "Settings of all groups at once: those of the paper, or those of a figure in a minute or two.",
     "preset/figure": "What a preset does to a figure.",
-<<<<<<< HEAD
-    "preset/study": "What a preset does to an experiment of one run.",
-=======
-    "preset/study": "What a preset does to a study that is no figure.",
->>>>>>> 02f966f (Docs: the groups few_labels and preset/study say how they are chosen)
+    "preset/study": "What a preset does to an experiment that is no figure.",
     "pretrain": "Pretraining: rate, updates, which layers at once.",
     "sampler": "What supplies the negative phase; [where each one sits](../concepts.md).",
     "solver": "What looks for ground states of the QUBO, of the samplers that need one and of `memcomp-solve`.",
