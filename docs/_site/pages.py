@@ -49,6 +49,8 @@ GROUP_TEXTS = {
     "callbacks": "What is looked at while training runs; [all callbacks](../callbacks.md).",
     "control": "What a single run does instead, to see what an effect is due to.",
     "data": "Images, their partitions, batches and held-out share.",
+    "data/training": "How energy models of a kind of data are trained; the data choose it.",
+    "density": "A comparison of density models; `experiment=density` chooses it.",
     "experiment": "Named combinations of settings: figures, comparisons.",
     "figure": "Curves, sizes and claims of a figure; the experiments of that name choose them.",
     "figure/curves": "Curves that a figure adds to its own.",
@@ -266,6 +268,8 @@ SET_BY = {
     "worth": "an `experiment` sets it: `experiment=sampler_worth` or `experiment=joint_likelihood`",
     "preset/figure": "`preset={option}`, beside an `experiment` that is a figure",
     "preset/study": "by an experiment and a preset: `experiment=few_labels preset=quick`",
+    "density": "an `experiment` sets it: `experiment={option}`",
+    "data/training": "by the data: `data={option}`",
     "few_labels": "an `experiment` sets it: `experiment={option}`",
     "hparams": "`-m hparams={option}`",
 }
