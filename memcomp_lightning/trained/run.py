@@ -205,7 +205,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     if place is not None:
         files = ({} if place.stage == "pretrain" else files) | {place.stage: place.file}
     states = {name: tensors_of(where) for name, where in files.items() if where.is_file() or place is not None}
-    if not states:
+    if not states and not folder.weights("updown").is_file():
         begun = [folder.checkpoint(name) for name in files if folder.checkpoint(name).is_file()]
         as_it_is = f", or name its checkpoint as it is, {begun[0]}" if begun else ""
         raise UserError(f"{path} has no trained weights yet: go on with memcomp-train resume={path}{as_it_is}")
@@ -213,7 +213,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
         warn(
             f"{path} has not finished: it has {' and '.join(states)} alone. Go on with memcomp-train resume={path}"
         )
-    pairs, edges = next(iter(states.values())).get("pairs"), config.model.get("connectivity")
+    pairs, edges = next(iter(states.values()), {}).get("pairs"), config.model.get("connectivity")
     if isinstance(pairs, Tensor) and isinstance(edges, DictConfig):
         # Its file may be elsewhere, and pictures are not known here. It joins sites, pairs are of their entries.
         visible = _units_of(config, schema)

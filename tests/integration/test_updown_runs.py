@@ -104,6 +104,13 @@ def test_a_command_trains_a_copy_of_the_pretrained_network(
     assert model.generative[0].weight.equal(start.generative[0].weight)
     with pytest.raises(UserError, match="updown=contrastive"):
         load_generative("without")
+    outcome = memcomp_train(
+        *COMMAND, *still, "pretrain.iterations=0", "finetune.iterations=0", "hydra.run.dir=alone"
+    )
+    assert outcome.status == 0, outcome.err
+    assert load_generative("alone").top.weight.equal(read("alone", "updown")["top.weight"])
+    with pytest.raises(UserError, match="was not pretrained"):
+        load_generative("alone", pretrained=True)
     other = read("without", "finetune")
     assert all(other[name].equal(tensor) for name, tensor in read("with", "finetune").items())
 
