@@ -101,7 +101,7 @@ def test_a_command_trains_a_copy_of_the_pretrained_network(
     model, start = load_generative("with"), load_generative("with", pretrained=True)
     assert model.n_classes == len(found["top.b"]) - 6 > 1
     assert start.n_classes == 0
-    assert model.generative[0].weight.equal(start.generative[0].weight)
+    assert model.downward[0].weight.equal(start.downward[0].weight)
     with pytest.raises(UserError, match="updown=contrastive"):
         load_generative("without")
     outcome = memcomp_train(
