@@ -125,7 +125,8 @@ def test_every_option_of_every_group_has_its_place(site: Path, pages: dict[Path,
         for path in (ROOT / "conf" / group).glob("*.yaml"):
             assert path.stem in page.ids, path
             # An experiment or a preset sets these.
-            refused = group.as_posix() in ("figure", "worth", "few_labels", "preset/figure", "preset/study")
+            set_by = ("figure", "worth", "density", "few_labels", "preset/figure", "preset/study", "data/training")
+            refused = group.as_posix() in set_by
             assert (f"{group.as_posix()}={path.stem}" in page.text) != refused, path
             lines = [line for line in path.read_text().splitlines() if not line.startswith("# @package")]
             assert lines[0].startswith("# "), f"{path} does not say what it is"
