@@ -24,6 +24,12 @@ TABLE_LAST_RATE = 0.01
 TABLE_UPDATES = 10_000
 """Updates, where no passes are given; there are ten passes at least."""
 
+TABLE_HIDDEN = 128
+"""Hidden units."""
+
+TABLE_LADDERS, TABLE_TEMPERATURES = 20, 5
+"""Of parallel tempering, its negative phase: a hundred states in all."""
+
 N_CHAINS = 100
 """Persistent chains."""
 

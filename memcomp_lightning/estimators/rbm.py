@@ -17,10 +17,12 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import on_the_cpu
 from memcomp_lightning.data import Batches
 from memcomp_lightning.defaults import (
-    N_CHAINS,
     TABLE_BATCH_SIZE,
+    TABLE_HIDDEN,
+    TABLE_LADDERS,
     TABLE_LAST_RATE,
     TABLE_LEARNING_RATE,
+    TABLE_TEMPERATURES,
     TABLE_UPDATES,
     WEIGHT_STD,
 )
@@ -51,7 +53,7 @@ from memcomp_lightning.likelihood import (
 )
 from memcomp_lightning.likelihood.chains import MOST_BEHIND, gap_of_chains
 from memcomp_lightning.models.chains import sweep
-from memcomp_lightning.samplers import PCD
+from memcomp_lightning.samplers import ParallelTempering
 from memcomp_lightning.training import Greedy, LearningRateDecay, PhaseTraining, require_finite
 
 MOST_WEIGHTS = 2**18
@@ -74,8 +76,8 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
 
     Args:
         n_components: Hidden units, >= 1.
-        sampler: Supplies the negative phase; None is ``PCD(n_chains=100)``. Its settings are ``sampler__k`` and so
-            on, for ``set_params`` and searches.
+        sampler: Supplies the negative phase; None is ``ParallelTempering(n_chains=20, n_temperatures=5)``. Its
+            settings are ``sampler__k`` and so on, for ``set_params`` and searches.
         learning_rate: Of plain gradient descent, > 0.
         last_rate: Share of the learning rate in the last pass of ``fit``, to which it falls linearly, in (0, 1].
             At a rate that stays chains lag behind the model and may stop mixing.
@@ -101,15 +103,15 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
     (4, 2)
     """
 
-    n_components: int = 64
+    n_components: int = TABLE_HIDDEN
     _: KW_ONLY
     learning_rate: float = TABLE_LEARNING_RATE
     last_rate: float = TABLE_LAST_RATE
     batch_size: int | None = TABLE_BATCH_SIZE
     n_iter: int | None = None
 
-    def _default_sampler(self) -> PCD:
-        return PCD(n_chains=N_CHAINS)
+    def _default_sampler(self) -> ParallelTempering:
+        return ParallelTempering(n_chains=TABLE_LADDERS, n_temperatures=TABLE_TEMPERATURES)
 
     def fit(self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None) -> Self:
         """Train from new weights.

@@ -510,7 +510,7 @@ def test_settings_of_a_sampler_have_names():
     pipeline = make_pipeline(MemcompRBM(2, n_iter=1, random_state=0))
     assert pipeline.get_params()["memcomprbm__sampler__k"] == 1
     pipeline.set_params(memcomprbm__sampler__k=5)
-    assert pipeline[0].sampler == PCD(n_chains=100, k=5)
+    assert pipeline[0].sampler == ParallelTempering(n_chains=20, n_temperatures=5, k=5)
     made = MemcompRBM(sampler=ASSISTED)
     names = {name for name in made.get_params() if name.startswith("sampler__")}
     assert {"sampler__inner__k", "sampler__schedule__p_max", "sampler__mode__solver__n_restarts"} <= names
@@ -663,6 +663,9 @@ def test_the_command_line_trains_by_the_same_defaults():
     assert pretrain.updates == defaults.TABLE_UPDATES
     assert pretrain.schedules.decay.final == signature["last_rate"]
     assert of_table.model.hidden_sizes == [signature["n_components"]]
+    tempering = MemcompRBM()._default_sampler()
+    assert (of_table.sampler.n_chains, of_table.sampler.n_temperatures) == (20, 5)
+    assert (tempering.n_chains, tempering.n_temperatures) == (20, 5)
     pretrain = config.pretrain
     assert pretrain.initial_bias == "data"
     assert pretrain.centring.rate == defaults.CENTRING_RATE
