@@ -32,8 +32,15 @@ def few_labels_figures(results: Accuracies) -> dict[str, Figure]:
                 capsize=2,
             )
         axes.set(xscale="log", title=panel, xlabel="labels")
+        numbers = sorted({results.n_labels(n) for n in results.labels})
+        axes.set_xticks(numbers, [f"{n:,}" for n in numbers])
+        axes.minorticks_off()
         axes.grid(alpha=0.25)
         axes.legend(fontsize=7, frameon=False, loc="lower right")
+    # Intervals of two draws may be wider than the picture: they are cut off.
+    means = [results.of(n, name).mean for n in results.labels for name in results.methods(n)]
+    margin = 0.05 * (max(means) - min(means)) + 0.01
+    all_axes[0].set_ylim(min(means) - margin, max(means) + margin)
     all_axes[0].set_ylabel("accuracy on test images (grey: best pretraining)")
     return {"few_labels": figure}
 
