@@ -65,7 +65,7 @@ class Classical(ABC):
     """
 
     features: Features
-    most: int | None = None
+    most: int | None
 
     def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""

@@ -67,9 +67,9 @@ class LabelRbm:
     """
 
     pretrained: str
-    layer: int = 0
+    layer: int
     discriminative: bool
-    generative: float = 0.0
+    generative: float
     unlabelled: float = 1.0
 
     def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:

@@ -193,10 +193,10 @@ LEARNERS = {
     "network": Network(start=Pretrained(of=None)),
     "batch norm": Network(start=BatchNormRelu()),
     "shuffled": Network(start=Pretrained(of="cd", change=Shuffled())),
-    "regression": Regression(features=Pixels()),
-    "components": Regression(features=PrincipalComponents()),
+    "regression": Regression(features=Pixels(), most=None),
+    "components": Regression(features=PrincipalComponents(), most=None),
     "support vectors": SupportVectors(features=HiddenMeans(pretrained="cd"), most=9),
-    "class unit": LabelRbm(pretrained="cd", discriminative=True, generative=0.1),
+    "class unit": LabelRbm(pretrained="cd", layer=0, discriminative=True, generative=0.1),
     "top class unit": LabelRbm(pretrained="cd", layer=1, discriminative=False, generative=1.0),
     "pseudo-labels": PseudoLabels(base=Network(start=BatchNormRelu()), unlabelled=40, passes=(1, 2)),
 }
