@@ -24,6 +24,9 @@ TABLE_LAST_RATE = 0.01
 TABLE_UPDATES = 10_000
 """Updates, where no passes are given; there are ten passes at least."""
 
+TABLE_MOST_PASSES = 200
+"""Passes where no rows are held out that would tell when a model learns its rows by heart."""
+
 TABLE_HIDDEN = 128
 """Hidden units."""
 

@@ -22,6 +22,7 @@ from memcomp_lightning.defaults import (
     TABLE_LADDERS,
     TABLE_LAST_RATE,
     TABLE_LEARNING_RATE,
+    TABLE_MOST_PASSES,
     TABLE_TEMPERATURES,
     TABLE_UPDATES,
     WEIGHT_STD,
@@ -83,7 +84,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             At a rate that stays chains lag behind the model and may stop mixing.
         batch_size: Samples an update, >= 1; None means all.
         n_iter: Passes over the data, >= 1; with ``early_stopping`` at most so many. None makes up 10,000 updates,
-            in ten passes at least.
+            in ten passes at least; without ``early_stopping`` in 200 at most: more would learn few rows by heart.
         centred: Follow the centred gradient.
         early_stopping: Hold out samples, stop once their :meth:`score` no longer rises, and keep the weights of
             the best pass.
@@ -170,7 +171,8 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         if self.n_iter is not None:
             return int(self.n_iter)
         n: int = samples.X.shape[0]
-        return max(10, round(TABLE_UPDATES / math.ceil(n / min(self.batch_size or n, n))))
+        passes = max(10, round(TABLE_UPDATES / math.ceil(n / min(self.batch_size or n, n))))
+        return passes if self.early_stopping else min(passes, TABLE_MOST_PASSES)
 
     def _begin(self, samples: Samples, seed: int, n_passes: int | None = None) -> None:
         """Draw weights; the rate falls over ``n_passes``, and stays where None is given."""

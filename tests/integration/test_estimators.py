@@ -693,3 +693,10 @@ def test_modules_train_by_the_same_defaults():
     settings = classifier.make_optimizer(parameter).defaults
     assert settings["lr"] == defaults.FINETUNING_LEARNING_RATE
     assert settings["momentum"] == defaults.FINETUNING_MOMENTUM
+
+
+@pytest.mark.parametrize(("n", "early", "passes"), [(50, False, 200), (50, True, 10_000), (10_000, False, 100)])
+def test_passes_follow_from_updates(n, early, passes):
+    samples = inputs.Samples(np.zeros((n, 2)), np.zeros(n), None)
+    assert MemcompRBM(early_stopping=early)._n_passes(samples) == passes
+    assert MemcompRBM(n_iter=3)._n_passes(samples) == 3
