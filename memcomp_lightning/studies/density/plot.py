@@ -41,7 +41,7 @@ def _test(results: Densities) -> Figure:
     panels[0].set_yticks(range(len(names)), [results.label(name) for name in names], size=8)
     panels[0].invert_yaxis()
     figure.supxlabel(
-        "test log-likelihood less that of the best, nats a row (crosses: estimates of log Z disagree)", size=8
+        "test log-likelihood less that of the best, nats a row\n(crosses: estimates of log Z disagree)", size=8
     )
     return figure
 

@@ -27,6 +27,7 @@ class Found(NamedTuple):
     Attributes:
         setting: That held-out rows chose.
         test: Log-likelihood of test rows, a number a seed: the lower of both estimates.
+        highest: The same by the higher of both estimates.
         gap: By how much AIS is above reverse AIS, the largest of all seeds.
         standard_error: Of log Z, the largest of all seeds.
         valid: Of held-out rows, by which the pass was chosen, too.
@@ -38,6 +39,7 @@ class Found(NamedTuple):
 
     setting: Setting
     test: NDArray[np.float64]
+    highest: NDArray[np.float64]
     gap: float
     standard_error: float
     valid: float
@@ -112,6 +114,7 @@ class Densities:
         return Found(
             setting=json.loads(own[0].setting),
             test=np.minimum(up, down),
+            highest=np.maximum(up, down),
             gap=float((up - down)[np.abs(up - down).argmax()]),
             standard_error=float(last("standard_error").max()),
             valid=float(last("valid_best").mean()),
@@ -133,7 +136,8 @@ DENSITY_RULE = (
     "them. A negative phase is worth its time if its mean is higher than that of the best CD or PCD (by held-out "
     "rows) that takes at most a tenth more time (or of the quickest, where none does): Welch's t over seeds, "
     "two-sided, p < .05 after Holm's correction for all these lines. A likelihood is given as a number where AIS "
-    f"and reverse AIS agree within {WITHIN:g} nat."
+    f"and reverse AIS agree within {WITHIN:g} nat; a CD or PCD whose estimates do not agree stands against others "
+    "by the higher of both."
 )
 
 
@@ -165,29 +169,32 @@ def _against_peers(results: Densities) -> list[Verdict]:
 def _of_phases(results: Densities, baselines: Sequence[str]) -> list[Verdict]:
     pairs = []
     for table in results.tables:
-        found = {name: own for name, own in results.of(table).items() if own.known}
+        found = results.of(table)
         basic = {name: found[name] for name in baselines if name in found}
         for name, own in found.items():
             model = results.plan.models.get(name)
-            if model is None or not model.compared or name in baselines or not basic:
+            if model is None or not model.compared or not own.known or name in baselines or not basic:
                 continue
             limit = max(1.1 * own.seconds, min(other.seconds for other in basic.values()))
             able = {other: one for other, one in basic.items() if one.seconds <= limit}
             pairs.append((table, name, own, *max(able.items(), key=lambda item: item[1].valid)))
-    tests = [stats.ttest_ind(own.test, other.test, equal_var=False) for _, _, own, _, other in pairs]
+    others = [other.test if other.known else other.highest for *_, other in pairs]
+    tests = [
+        stats.ttest_ind(pair[2].test, other, equal_var=False) for pair, other in zip(pairs, others, strict=True)
+    ]
     p_values = holm([1.0 if math.isnan(test.pvalue) else float(test.pvalue) for test in tests])
     lines = []
-    for (table, name, own, against, other), test, p in zip(pairs, tests, p_values, strict=True):
-        gain = own.mean - other.mean
-        interval = (
-            test.confidence_interval() if len(own.test) > 1 and len(other.test) > 1 else (math.nan, math.nan)
-        )
+    for (table, name, own, against, other), values, test, p in zip(pairs, others, tests, p_values, strict=True):
+        mean = float(values.mean())
+        several = min(len(own.test), len(values)) > 1
+        low, high = test.confidence_interval() if several else (math.nan, math.nan)
+        doubt = "" if other.known else " at most"
         lines.append(
             Verdict(
                 f"{table}: {results.label(name)} beats {results.label(against)}",
-                f"{own.mean:.2f} against {other.mean:.2f}; {own.seconds:.0f} s and {other.seconds:.0f} s a seed",
-                f"{gain:+.2f} [{interval[0]:+.2f}, {interval[1]:+.2f}], p = {p:.2g}",
-                HOLDS if gain > 0 and p < 0.05 else FAILS,
+                f"{own.mean:.2f} against{doubt} {mean:.2f}; {own.seconds:.0f} s and {other.seconds:.0f} s a seed",
+                f"{own.mean - mean:+.2f} [{low:+.2f}, {high:+.2f}], p = {p:.2g}",
+                HOLDS if own.mean > mean and p < 0.05 else FAILS,
             )
         )
     return lines
