@@ -277,7 +277,7 @@ class Tuned(NamedTuple):
             "nearest neighbours": f"k = {self.k_fill} to fill, {self.k_near} to tell",
             "IterativeImputer": f"of {columns} columns",
             "IsolationForest": forest,
-            "RBM at the defaults": f"{AS_TYPED}, {AS_TYPED.passes} passes",
+            "RBM at the defaults of 0.2": f"{AS_TYPED}, {AS_TYPED.passes} passes",
             "RBM": f"{self.settings}, {self.settings.passes} passes",
         }
 
@@ -352,7 +352,7 @@ METHODS: dict[str, Callable[[Data, Tuned, int], Found]] = {
     "nearest neighbours": nearest_rows,
     "IterativeImputer": iterations,
     "IsolationForest": trees,
-    "RBM at the defaults": untuned_rbm,
+    "RBM at the defaults of 0.2": untuned_rbm,
     "RBM": rbm,
     "the true distribution": truth,
 }

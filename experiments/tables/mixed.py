@@ -279,7 +279,7 @@ def made(plan: Plan) -> Iterator[dict[str, Any]]:
     fixed: dict[str, tuple[Method, str]] = {
         "independent columns": (independent, ""),
         "mixture of classes": (partial(of_mixture, k), f"{k} classes"),
-        "RBM at the defaults": (partial(as_typed, plan.typed), f"{plan.typed}, {plan.typed.passes} passes"),
+        "RBM at the defaults of 0.2": (partial(as_typed, plan.typed), f"{plan.typed}, {plan.typed.passes} passes"),
     }
     for name, (method, settings) in fixed.items():
         models = [method(split, n_samples) for split in splits]
@@ -303,7 +303,7 @@ def of_scikit_learn(name: str, plan: Plan) -> Iterator[dict[str, Any]]:
     methods: dict[str, Method] = {
         "independent columns": independent,
         "GaussianMixture": partial(gaussian_mixture, plan.components),
-        "RBM at the defaults": partial(as_typed, plan.typed),
+        "RBM at the defaults of 0.2": partial(as_typed, plan.typed),
         "RBM": partial(chosen_here, plan.of_shipped),
         "training rows": training_rows,
     }

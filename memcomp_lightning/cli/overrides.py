@@ -199,7 +199,7 @@ def _check_options(overrides: Sequence[str], config_name: str, paths: Sequence[s
         if name in groups and adds and name in plain().hydra.runtime.choices:
             raise UserError(f"{typed} is not possible: {name} has one option. Write {str(typed).lstrip('+')}")
         if name in STUDIES and not adds:
-            experiments = ", ".join(loader.get_group_options("experiment"))
+            experiments = ", ".join(name for name in loader.get_group_options("experiment") if name != "none")
             remedy = f"Write experiment=NAME. Known here: {experiments}."
             raise UserError(f"{typed} is not possible: an experiment sets it. {remedy}")
         if name in groups and not override.is_delete() and not override.is_sweep_override():

@@ -145,7 +145,7 @@ def _free_blocks(model: EnergyModel, clamped: str) -> list[Block]:
         if len(places) == block.kind.n:
             found.append(block)
         elif places:
-            keep = torch.tensor(places, device=units.device)
+            keep = _among(block.units, model.n_visible, clamped).nonzero().flatten()
             couplings, bias = block.couplings.index_select(-2, keep), block.bias.index_select(-1, keep)
             found.append(Block(block.units[keep], block.neighbours, couplings, bias, block.kind.select(keep)))
     return found

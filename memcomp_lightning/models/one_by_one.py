@@ -88,4 +88,5 @@ def _low_and_width(block: Block) -> tuple[float, float]:
 
 
 def _column(values: Iterable[float], like: Tensor) -> Tensor:
-    return torch.tensor(list(values), dtype=like.dtype, device=like.device)
+    # Filled on the device: a copy of values from the host would wait for it.
+    return torch.cat([like.new_full((len(list(equal)),), value) for value, equal in groupby(values)])

@@ -62,12 +62,15 @@ def test_mode_assistance_spans_the_training_and_wants_whole_updates(memcomp_trai
 
 MANY_RUNS = (
     *("figure2", "figure4", "figure5", "figure6", "all_figures", "readings", "joint", "annealer"),
-    *("sampler_worth", "joint_likelihood", "density"),
+    *("sampler_worth", "joint_likelihood", "density", "few_labels"),
 )
 """Experiments with tests of their own."""
 
+OTHERS = [name for name in options("experiment") if name not in (*MANY_RUNS, "full_size")]
+"""Those that train at once, without MNIST."""
 
-@pytest.mark.parametrize("experiment", [name for name in options("experiment") if name not in MANY_RUNS])
+
+@pytest.mark.parametrize("experiment", OTHERS)
 def test_every_experiment_runs_fast(memcomp_train: Run, experiment: str) -> None:
     outcome = memcomp_train(f"experiment={experiment}", "trainer.fast_dev_run=true", "solver.max_steps=20")
     assert outcome.status == 0, outcome.err

@@ -152,7 +152,7 @@ def test_new_rows_of_the_same_columns_are_read_as_the_old_ones(memcomp_train: Ru
         (["data.path=other.csv"], "other.csv has no column 'size'"),
         (["data.path=unknown.csv"], "unknown.csv, column 'kind', row 3: 'd'"),
         (["data.columns={size: category}"], "data.columns = {'size': 'category'} is not allowed: expected None"),
-        (["data=shifting_bars", "model.hidden_sizes=[64]", "units=bernoulli"], "units"),
+        (["data=shifting_bars", "model.hidden_sizes=[128]", "units=bernoulli"], "units"),
     ):
         outcome = memcomp_train("continue=first", *settings, "hydra.run.dir=third")
         assert outcome.status != 0

@@ -136,7 +136,7 @@ def test_every_option_of_every_group_has_its_place(site: Path, pages: dict[Path,
 def test_defaults_are_marked(site: Path, pages: dict[Path, Contents]) -> None:
     for group, default in (("sampler", "dmm_qubo"), ("data", "digits"), ("solver-field", "clause")):
         assert f"{default} (default)" in pages[site / "config" / group / "index.html"].text
-    assert "(default)" not in pages[site / "config/experiment/index.html"].text
+    assert "(default)" not in pages[site / "config/hparams/index.html"].text
 
 
 @pytest.mark.parametrize("package", PACKAGES)
