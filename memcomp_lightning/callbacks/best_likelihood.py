@@ -1,6 +1,5 @@
 """Early stopping of an energy model: the weights at which held-out rows were most likely."""
 
-from collections.abc import Mapping
 from typing import Any, ClassVar, cast
 
 import lightning.pytorch as pl
@@ -82,14 +81,10 @@ class BestLikelihood(LogLikelihood):
 
     def state_dict(self) -> dict[str, Any]:
         """The values so far, and what is kept of the model in training."""
-        best = self._best
-        kept = {"value": best.value, "waited": best.waited, "weights": best.weights}
-        return {**super().state_dict(), "layer": self._layer, "best": kept}
+        return {**super().state_dict(), "layer": self._layer, "best": self._best.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         super().load_state_dict(state_dict)
         self._layer = int(state_dict.get("layer", 0))
-        kept: Mapping[str, Any] = state_dict.get("best", {})
-        for name, value in kept.items():
-            setattr(self._best, name, value)
+        self._best.load_state_dict(state_dict.get("best", {}))

@@ -64,10 +64,8 @@ class BestWeights(pl.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """What the best pass reached, how long none was better, and its weights."""
-        best = self._best
-        return {"value": best.value, "waited": best.waited, "weights": best.weights}
+        return self._best.state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
-        for name, value in state_dict.items():
-            setattr(self._best, name, value)
+        self._best.load_state_dict(state_dict)

@@ -1,6 +1,7 @@
 """Log-likelihood of training and held-out images, with log Z by enumeration or annealed importance sampling."""
 
 import logging
+from itertools import takewhile
 from typing import Any, ClassVar, Literal, TypedDict
 
 import lightning.pytorch as pl
@@ -22,7 +23,7 @@ from memcomp_lightning.callbacks.base import (
 )
 from memcomp_lightning.callbacks.sampler_diagnostics import chains_persist
 from memcomp_lightning.errors import require_choice, require_count
-from memcomp_lightning.likelihood.chains import MOST_BEHIND
+from memcomp_lightning.likelihood.chains import MOST_BEHIND, log_z_from_chains
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import RBM, EnergyModel
 from memcomp_lightning.models.machine import log2_states
@@ -127,7 +128,6 @@ class LogLikelihood(EveryIterations):
         self._heldout: list[tuple[Tensor, int]] = []
         self._judged_at = -1
         self._bits: Generator | None = None
-        self._behind = 0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Refuse models too large to enumerate; settle how often to look."""
@@ -190,7 +190,6 @@ class LogLikelihood(EveryIterations):
             values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
         log_scalars(pl_module, values)
         gap = values.get("log_z_gap")
-        self._say_if_behind(trainer, pl_module, gap)
         self.history.append(
             LikelihoodValue(
                 layer=int(getattr(pl_module, "layer", 0)),
@@ -201,6 +200,7 @@ class LogLikelihood(EveryIterations):
                 gap=[] if gap is None else gap.flatten().tolist(),
             )
         )
+        self._say_if_behind(pl_module)
 
     def state_dict(self) -> dict[str, Any]:
         """The values so far."""
@@ -230,8 +230,7 @@ class LogLikelihood(EveryIterations):
         base = None if train is None else likelihood.base_of(train, model.visible, observed)
         down = None
         if chains is not None and isinstance(model, RBM):
-            reverse, generator = likelihood.ReverseAis(n_betas=self.n_betas), rng.stream(self.seed, "from chains")
-            down = reverse.estimate(model, chains, generator=generator, base=base).log_z
+            down = log_z_from_chains(model, chains, base=base, n_betas=self.n_betas, seed=self.seed)
         if method == "exact":
             log_z = likelihood.log_partition_function(model, max_units=self.max_units)
             return {"log_z": log_z} if down is None else {"log_z": log_z, "log_z_gap": log_z - down}
@@ -244,15 +243,16 @@ class LogLikelihood(EveryIterations):
         }
         return values if down is None else {**values, "log_z_gap": estimate.log_z - down}
 
-    def _say_if_behind(self, trainer: pl.Trainer, module: pl.LightningModule, gap: Tensor | None) -> None:
-        """Warn where the chains are no samples of the model any more, once a model."""
-        if gap is None:
-            return
-        worst, done = float(gap.max()), iteration_of(module) + 1
-        self._behind = self._behind + 1 if worst > MOST_BEHIND else 0
-        is_last = done == getattr(module, "iterations", None)
-        if self._behind == 2 or (is_last and self._behind == 1):
-            log.warning("%s, pass %d: %s", prefix_of(module), done, behind(worst))
+    def _say_if_behind(self, module: pl.LightningModule) -> None:
+        """Warn where the chains are no samples of the model any more: at the second look in a row, or the last."""
+        newest = self.history[-1]
+        looks = (value for value in reversed(self.history) if value["layer"] == newest["layer"])
+        behind_so_far = sum(
+            1 for _ in takewhile(lambda value: max(value["gap"], default=0.0) > MOST_BEHIND, looks)
+        )
+        is_last = newest["iteration"] == getattr(module, "iterations", None)
+        if behind_so_far == 2 or (is_last and behind_so_far == 1):
+            log.warning("%s, pass %d: %s", prefix_of(module), newest["iteration"], behind(max(newest["gap"])))
 
     @staticmethod
     def _total(model: EnergyModel, v: Tensor, observed: Tensor | None, bits: Generator) -> Tensor:

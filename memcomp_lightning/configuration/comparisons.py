@@ -7,7 +7,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.configuration.composition import check_not_given, composed_for
+from memcomp_lightning.configuration.composition import (
+    check_not_given,
+    composed_for,
+    settings_of_comparison,
+)
 from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import UserError, require, require_choice
@@ -67,9 +71,9 @@ def _trials(comparison: Comparison, overrides: Sequence[str], folder: Path) -> I
             method = comparison.methods[method_name]
             passes = max(1, round(data_set.passes * method.longer))
             own_overrides = (*method.overrides, *data_set.overrides)
-            usual = composed_for(overrides, (*own_overrides, *_run_settings(passes)))
+            usual = composed_for(overrides, (*own_overrides, *settings_of_comparison(passes)))
             iterations, greedy_passes, all_passes = _schedule(usual, passes, method)
-            composed = composed_for(overrides, (*own_overrides, *_run_settings(iterations)))
+            composed = composed_for(overrides, (*own_overrides, *settings_of_comparison(iterations)))
             for rate in data_set.rates or method.rates or comparison.rates:
                 own: Any = OmegaConf.to_container(composed, resolve=False)
                 own["pretrain"] = {**own["pretrain"], "optimizer": {**own["pretrain"]["optimizer"], "lr": rate}}
@@ -98,17 +102,6 @@ def _schedule(composed: DictConfig, passes: int, method: Method) -> tuple[int, i
     greedy = round(passes * method.greedy_start / layers)
     joint = max(1, passes - greedy * layers)
     return joint, greedy, greedy * layers + joint
-
-
-def _run_settings(passes: int) -> tuple[str, ...]:
-    """No fine-tuning, plain gradient descent at a rate that falls to a hundredth."""
-    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:" + str(passes) + "}"
-    return (
-        f"pretrain.iterations={passes}",
-        "finetune.iterations=0",
-        "pretrain.schedules.momentum=null",
-        f"pretrain.schedules.decay={decay}",
-    )
 
 
 def _points(passes: int, n: int) -> tuple[int, ...]:

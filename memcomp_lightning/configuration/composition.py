@@ -72,6 +72,18 @@ def _applies(name: str, config: DictConfig) -> bool:
     return isinstance(node, DictConfig) and key in node
 
 
+def settings_of_comparison(passes: int) -> tuple[str, ...]:
+    """No fine-tuning, plain gradient descent at a rate that falls to a hundredth, for so many passes."""
+    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:" + str(passes) + "}"
+    return (
+        f"pretrain.iterations={passes}",
+        "finetune.iterations=0",
+        "pretrain.schedules.momentum=null",
+        "pretrain.keep_best=false",
+        f"pretrain.schedules.decay={decay}",
+    )
+
+
 def check_not_given(overrides: Iterable[str], instead: Mapping[str, str], of: str) -> None:
     """Refuse overrides of what a study of this kind sets itself.
 

@@ -12,7 +12,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.configuration.composition import check_not_given, composed_for
+from memcomp_lightning.configuration.composition import (
+    check_not_given,
+    composed_for,
+    settings_of_comparison,
+)
 from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import UserError, require, require_choice
@@ -151,11 +155,11 @@ def trial_of(
     own = [_filled_in(one, setting, f"{at}.overrides") for one in model.overrides]
     keys = ("data.path", "data.validation", "data.test")
     own += [f"{key}={json.dumps(file)}" for key, file in zip(keys, files, strict=True)]
-    first = composed_for(common, (*own, *_run_settings(1)))
+    first = composed_for(common, (*own, *settings_of_comparison(1)))
     plan = build(first)
     n_train, size = pretraining_of(plan)[0].data.n_train, first.pretrain.batch_size
     passes = max(1, round(setting["updates"] / math.ceil(n_train / min(size or n_train, n_train))))
-    composed = composed_for(common, (*own, *_run_settings(passes)))
+    composed = composed_for(common, (*own, *settings_of_comparison(passes)))
     settings: Any = OmegaConf.to_container(composed, resolve=False)
     return DensityTrial(
         method=name,
@@ -178,18 +182,6 @@ def _filled_in(override: str, setting: Setting, at: str) -> str:
         return str(setting[found[1]])
 
     return re.sub(r"\{(\w+)\}", value, override)
-
-
-def _run_settings(passes: int) -> tuple[str, ...]:
-    """No fine-tuning, plain gradient descent at a rate that falls to a hundredth."""
-    decay = "{_target_:memcomp_lightning.training.LearningRateDecay,n_passes:" + str(passes) + "}"
-    return (
-        f"pretrain.iterations={passes}",
-        "finetune.iterations=0",
-        "pretrain.schedules.momentum=null",
-        "pretrain.keep_best=false",
-        f"pretrain.schedules.decay={decay}",
-    )
 
 
 def _points(passes: int, n: int) -> tuple[int, ...]:

@@ -36,5 +36,12 @@ def gap_of_chains(
         seed: Of the draws.
     """
     up = Ais(n_chains=n_chains, n_betas=n_betas).estimate(rbm, generator=rng.stream(seed, "ais"), base=base)
+    return up.log_z - log_z_from_chains(rbm, chains, base=base, n_betas=n_betas, seed=seed)
+
+
+def log_z_from_chains(
+    rbm: RBM, chains: Visible, *, base: Tensor | None = None, n_betas: int = 300, seed: int = 0
+) -> PerReplica:
+    """Log Z by annealing from chains down to independent units; arguments are those of :func:`gap_of_chains`."""
     generator = rng.stream(seed, "from chains")
-    return up.log_z - ReverseAis(n_betas=n_betas).estimate(rbm, chains, generator=generator, base=base).log_z
+    return ReverseAis(n_betas=n_betas).estimate(rbm, chains, generator=generator, base=base).log_z

@@ -69,7 +69,7 @@ class LikelihoodTrial(Trial):
         stage, module = pretraining_of(plans[0])
         network = stacked([plan.network for plan in plans], ())
         batches = stage.data.train_batches(0, 1).repeated(range(n_replicas))
-        _warm_up(joint_model(network), module, next(iter(batches)).v)
+        warm_up(joint_model(network), module, next(iter(batches)).v)
         measure, seconds = MEASURES[self.comparison.data_sets[self.data_set].measure], 0.0
         score = measure.make(images_of(stage), n_reported)
         begin, reported = time.process_time(), 0
@@ -134,7 +134,7 @@ def _training(
     return passes, lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network)
 
 
-def _warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:
+def warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:
     """Compile and load what the first updates need, outside the time that is compared."""
     generator = rng.stream(0, "warm-up")
     positive = positive_phase(model, v)

@@ -1,6 +1,7 @@
 """Early stopping: of all passes the weights of the best, and when to wait no longer for a better one."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -42,6 +43,15 @@ class BestPass:
     def over(self) -> bool:
         """Whether no replica waits for a better pass any more."""
         return self.patience is not None and self.waited is not None and bool((self.waited >= self.patience).all())
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that it has kept, for checkpoints."""
+        return {"value": self.value, "waited": self.waited, "weights": self.weights}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`."""
+        for name, value in state_dict.items():
+            setattr(self, name, value)
 
     @torch.no_grad()
     def offer(self, value: Tensor, weights: Mapping[str, Tensor]) -> None:

@@ -15,10 +15,10 @@ from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood import log_likelihood_or_bound, log_partition_function
 from memcomp_lightning.likelihood.both_ways import estimate_both_ways
 from memcomp_lightning.models import EnergyModel, stacked
-from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.density.settings import Density
-from memcomp_lightning.studies.measures.gradient_bias import mean_gradient, without_diverged
+from memcomp_lightning.studies.likelihood import warm_up
+from memcomp_lightning.studies.measures.gradient_bias import without_diverged
 from memcomp_lightning.studies.plan import Trial, passes_without_trainer, pretraining_of
 from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError
@@ -87,7 +87,7 @@ class DensityTrial(Trial):
         assert plans[0].stage_for is not None
         own_stage = plans[0].stage_for(network)
         trained = cast(Any, own_stage.phases[0].model)
-        _warm_up(trained, module.sampler, next(iter(batches)).v)
+        warm_up(trained, module, next(iter(batches)).v)
         (train, _), (held_out, _) = data.train, data.heldout
         measured = dict[str, list[list[float]]](valid=[], train=[], log_z_gap=[])
         record = Record.of(self, at=[], seconds=[], measures=measured)
@@ -158,10 +158,3 @@ def independent_bits(train: Tensor, rows: Tensor) -> Tensor:
     """Mean log-likelihood of rows by independent bits with the means of training rows, one more of each value."""
     p = (train.double().sum(0) + 1) / (len(train) + 2)
     return torch.where(rows > 0.5, p.log(), (-p).log1p()).sum(-1).mean()
-
-
-def _warm_up(model: EnergyModel, sampler: Any, v: Tensor) -> None:
-    """Compile and load what the first updates need, outside the time that is compared."""
-    generator = rng.stream(0, "warm-up")
-    state = sampler.init(model, v.shape[-2], generator=generator)
-    mean_gradient(model, sampler, state, positive_phase(model, v), 1, generator=generator)
