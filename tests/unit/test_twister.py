@@ -31,6 +31,7 @@ def test_draws_are_the_same_before_and_after_it_is_loaded(monkeypatch):
     n, found = rng._MANY, []
     for pays_after in (10**9, 0):
         monkeypatch.setattr(rng, "_PAYS_AFTER", pays_after)
+        monkeypatch.setattr(rng, "_drawn", [0])
         generator = rng.stream(0, "draws")
         assert (rng._compiled_for(torch.empty(n)) is None) == (pays_after > 0)
         found.append([rng.uniform((k,), generator=generator) for k in (n, 3, n + 1)])
