@@ -2,6 +2,7 @@
 
 from memcomp_lightning.optional import on_demand
 from memcomp_lightning.samplers.base import NegativePhaseSampler, positive_phase, tensors_of, with_tensors
+from memcomp_lightning.samplers.bfloat16 import InBfloat16
 from memcomp_lightning.samplers.block_annealing import BlockAnnealing
 from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.exact import Exact
@@ -27,6 +28,7 @@ __all__ = [
     "Exact",
     "ExactPosterior",
     "GroundState",
+    "InBfloat16",
     "MeanField",
     "ModeAssisted",
     "ModeSchedule",

@@ -12,7 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from memcomp_lightning import __version__
-from memcomp_lightning.configuration.plans import Shape, classifier_of, network_of, units_of_settings
+from memcomp_lightning.configuration.networks import Shape, network_of, units_of_settings
+from memcomp_lightning.configuration.plans import classifier_of
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
 from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel

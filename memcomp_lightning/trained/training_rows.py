@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from memcomp_lightning.configuration.plans import rows_of
+from memcomp_lightning.configuration.rows import rows_of
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.runs.folder import RunFolder

@@ -5,7 +5,7 @@ from typing import cast
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from memcomp_lightning.configuration.plans import units_of_settings
+from memcomp_lightning.configuration.networks import units_of_settings
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.models import DBN, EnergyModel

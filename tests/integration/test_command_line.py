@@ -111,6 +111,7 @@ REFUSED = {
     "sead=3": ["sead=3", "Did you mean seed?"],
     "foo": ["foo is no setting", "NAME=VALUE"],
     "sampler=foo": ["sampler = 'foo'", "cd, dmm_qubo"],
+    "pretrain.products=bf17": ["pretrain.products = 'bf17'", "'float32', 'bf16'"],
     "pretrain.iterations=-1": ["pretrain.iterations = -1", "an integer >= 0"],
     "pretrain.iterations=abc": ["pretrain.iterations = 'abc'", "an integer >= 0"],
     "finetune.iterations=1.5": ["finetune.iterations = 1.5", "an integer >= 0"],
