@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.configuration.plans import rows_of
+from memcomp_lightning.configuration.rows import rows_of
 from memcomp_lightning.likelihood import Ais, base_of, recognition_bound
 from memcomp_lightning.models import GenerativeDBN
 from memcomp_lightning.plotting import picture_grid
