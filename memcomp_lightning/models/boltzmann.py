@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.linalg import vecdot
 
@@ -13,30 +13,15 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.affine import affine, plus_product
 from memcomp_lightning.models.base import Block, Hidden, PerState, QuadraticForm, TwoLayers, Visible
 from memcomp_lightning.models.chains import ClassChains
-from memcomp_lightning.models.connectivity import Pairs, colouring, from_mask, from_pairs, full
+from memcomp_lightning.models.connectivity import Pairs, pairs_of
 from memcomp_lightning.models.init import Initialiser, Normal
+from memcomp_lightning.models.layouts import INDICES, Layout, classes_of, layouts_of, of_entries
 from memcomp_lightning.models.machine import Machine, joined, log2_states, units_of
 from memcomp_lightning.models.mean_field import free_energy_of_means, mean_field
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import Bernoulli, Mixed, Units, all_states, side_by_side
 from memcomp_lightning.rng import stream
 from memcomp_lightning.types import Configurations, Weighted
-
-
-class _Layout(NamedTuple):
-    """Where the couplings of a block go: number ``edge`` of the list into ``slot`` of its flat matrix.
-
-    The first ``n_forward`` have their other end in a later block: all blocks together have each pair once there.
-    """
-
-    units: Tensor
-    neighbours: Tensor
-    edge: Tensor
-    slot: Tensor
-    n_forward: int
-
-
-_INDICES = ("units", "neighbours", "edge", "slot")
 
 _DENSE = 0.5
 """Share of all pairs of units from which on couplings stand in one matrix, not in one for each class."""
@@ -111,8 +96,8 @@ class BoltzmannMachine(Machine):
         n_visible, n_units = visible.n, visible.n + hidden.n
         site_of = torch.cat((visible.site_of(), hidden.site_of() + visible.n_sites))
         n_sites = visible.n_sites + hidden.n_sites
-        site_pairs = _pairs_of(n_sites, connectivity)
-        pairs = _of_entries(site_pairs, site_of, n_sites)
+        site_pairs = pairs_of(n_sites, connectivity)
+        pairs = of_entries(site_pairs, site_of, n_sites)
         _refuse_real_pairs(visible, pairs)
         alone = torch.bincount(site_pairs.flatten(), minlength=n_sites)[: visible.n_sites] == 0
         require(
@@ -129,7 +114,7 @@ class BoltzmannMachine(Machine):
         self.coupling = nn.Parameter(draw)
         self.b = nn.Parameter(draw.new_zeros(*replicas, n_visible))
         self.c = nn.Parameter(draw.new_zeros(*replicas, hidden.n))
-        classes_of_sites = _classes(n_sites, site_pairs, site_of[:n_visible][_is_real(visible)].unique())
+        classes_of_sites = classes_of(n_sites, site_pairs, site_of[:n_visible][_is_real(visible)].unique())
         coloured = [torch.isin(site_of, sites).nonzero().flatten() for sites in classes_of_sites]
         classes = sorted(coloured, key=lambda units: -int((units < n_visible).sum()))
         kinds = [_kind_of(self.visible, self.hidden, units) for units in classes]
@@ -139,9 +124,9 @@ class BoltzmannMachine(Machine):
         # Of two classes the blocks are halves of such a matrix already.
         self._dense = len(classes) > 2 and 2 * len(pairs) >= _DENSE * n_units * (n_units - 1)
         self._n_forward: list[int] = []
-        for number, layout in enumerate(_layouts(n_units, pairs, classes)):
+        for number, layout in enumerate(layouts_of(n_units, pairs, classes)):
             self._n_forward.append(layout.n_forward)
-            for name in _INDICES:
+            for name in INDICES:
                 self.register_buffer(f"_{name}{number}", getattr(layout, name), persistent=False)
 
     def other_pairs(self, pairs: Tensor | None) -> str:
@@ -185,10 +170,10 @@ class BoltzmannMachine(Machine):
         """Indices of the units of each colour."""
         return [layout.units for layout in self._layouts()]
 
-    def _layouts(self) -> list[_Layout]:
+    def _layouts(self) -> list[Layout]:
         buffers: dict[str, Any] = self._buffers  # many of them are asked for at each sweep
         return [
-            _Layout._make([*(buffers[f"_{name}{number}"] for name in _INDICES), n_forward])
+            Layout._make([*(buffers[f"_{name}{number}"] for name in INDICES), n_forward])
             for number, n_forward in enumerate(self._n_forward)
         ]
 
@@ -209,7 +194,7 @@ class BoltzmannMachine(Machine):
         parts = zip(layouts, couplings, biases, kinds, strict=True)
         return [Block(layout.units, layout.neighbours, weight, bias, kind) for layout, weight, bias, kind in parts]
 
-    def _weights_of(self, layouts: Sequence[_Layout]) -> list[Tensor]:
+    def _weights_of(self, layouts: Sequence[Layout]) -> list[Tensor]:
         """Couplings of the units of each class to their neighbours, ``(*replicas, n_class, n_neighbours)``."""
         return [
             self._placed((len(units), len(neighbours)), slot, self.coupling.index_select(-1, edge))
@@ -380,46 +365,6 @@ def _folded(model: BoltzmannMachine) -> RBM:
     return rbm
 
 
-def _pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | None) -> Pairs:
-    if connectivity is None:
-        return full(n_units)
-    if isinstance(connectivity, Tensor) and connectivity.shape == (n_units, n_units) != (2, 2):
-        return from_mask(connectivity)
-    if isinstance(connectivity, Tensor) and (connectivity.ndim != 2 or connectivity.shape[1] != 2):
-        require(False, "shape of connectivity", tuple(connectivity.shape), f"{(n_units, n_units)} or (n_pairs, 2)")
-    return from_pairs(n_units, connectivity)
-
-
-def _layouts(n_units: int, pairs: Pairs, classes: Sequence[Tensor]) -> list[_Layout]:
-    colour, place = pairs.new_empty(n_units), pairs.new_empty(n_units)
-    for number, units in enumerate(classes):
-        colour[units], place[units] = number, torch.arange(len(units), device=pairs.device)
-    found = []
-    for number, units in enumerate(classes):
-        ends, edges = [], []
-        for here, there in ((0, 1), (1, 0)):
-            edge = (colour[pairs[:, here]] == number).nonzero().flatten()
-            ends.append(torch.stack((pairs[edge, here], pairs[edge, there]), dim=-1))
-            edges.append(edge)
-        end, edge = torch.cat(ends), torch.cat(edges)
-        forward = colour[end[:, 1]] > number
-        order = forward.to(torch.int8).argsort(descending=True, stable=True)
-        end, edge = end[order], edge[order]
-        neighbours, column = end[:, 1].unique(return_inverse=True)
-        slot = place[end[:, 0]] * len(neighbours) + column
-        found.append(_Layout(units, neighbours, edge, slot, int(forward.sum())))
-    return found
-
-
-def _of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor, "n_entry_pairs 2"]:
-    """Pairs of entries, all of one site with all of the other, in ascending order."""
-    if len(site_of) == n_sites:
-        return site_pairs
-    entries = torch.arange(len(site_of), device="cpu").split(torch.bincount(site_of, minlength=n_sites).tolist())
-    found = torch.cat([torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist()])
-    return found[(found[:, 0] * len(site_of) + found[:, 1]).argsort()]
-
-
 def _kind_of(visible: Units, hidden: Units, entries: Tensor) -> Units:
     """What some entries of a machine are."""
     if isinstance(visible, Bernoulli) and isinstance(hidden, Bernoulli):
@@ -433,22 +378,6 @@ def _is_real(units: Units) -> Tensor:
     if isinstance(units, Mixed):
         return torch.cat([_is_real(kind) for kind in units.kinds])
     return torch.full((units.n,), units.real, dtype=torch.bool, device="cpu")
-
-
-def _classes(n_sites: int, pairs: Pairs, real: Tensor) -> list[Tensor]:
-    """Classes of sites without couplings inside; real ones are in one, as no other class has a list of states."""
-    classes = colouring(n_sites, pairs)
-    if sum(bool(torch.isin(sites, real).any()) for sites in classes) <= 1:
-        return classes
-    number = torch.arange(n_sites, device="cpu")
-    number[real] = real[0]
-    ends, _ = number[pairs].sort(dim=-1)
-    apart = colouring(n_sites, ends.unique(dim=0))
-    found = []
-    for sites in apart:
-        own = sites[~torch.isin(sites, real)]
-        found.append(torch.cat((own, real)).sort().values if bool((sites == real[0]).any()) else own)
-    return [sites for sites in found if len(sites)]
 
 
 def _refuse_real_pairs(visible: Units, pairs: Pairs) -> None:

@@ -173,6 +173,17 @@ def colouring(n_units: int, pairs: Pairs) -> list[Int[Tensor, " n_class"]]:
     return [(colours == colour).nonzero().flatten() for colour in range(max(found) + 1)]
 
 
+def pairs_of(n_units: int, connectivity: Tensor | Iterable[tuple[int, int]] | None) -> Pairs:
+    """The pairs that a connectivity names: a mask, a list of pairs, or None for all."""
+    if connectivity is None:
+        return full(n_units)
+    if isinstance(connectivity, Tensor) and connectivity.shape == (n_units, n_units) != (2, 2):
+        return from_mask(connectivity)
+    if isinstance(connectivity, Tensor) and (connectivity.ndim != 2 or connectivity.shape[1] != 2):
+        require(False, "shape of connectivity", tuple(connectivity.shape), f"{(n_units, n_units)} or (n_pairs, 2)")
+    return from_pairs(n_units, connectivity)
+
+
 def _greedy(neighbours: list[list[int]], order: Sequence[int]) -> list[int]:
     colour = [-1] * len(neighbours)
     for unit in order:
