@@ -10,6 +10,8 @@ processor. A peer that cannot tell its likelihood writes ``weights`` instead, an
 """
 
 import json
+import logging
+import math
 import os
 import subprocess
 import tempfile
@@ -27,6 +29,8 @@ from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.density.trial import scores_of
 from memcomp_lightning.studies.records import Named, Record
 from memcomp_lightning.studies.search import Axes, Setting, checked_start
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +92,23 @@ class PeerTrial(Named):
         return f"{self.data_set}, {self.method}, {self.setting}"
 
     def run(self, progress: Progress) -> list[Record]:
-        """Fit it in a process of its own, with one thread."""
+        """Fit it in a process of its own, with one thread.
+
+        Not every setting suits every table (some learners split no table of few rows): while a setting is being
+        chosen, one that cannot be fitted loses.
+        """
         progress(self.title, 0)
+        try:
+            record = self._fitted()
+        except UserError as error:
+            if not self.choosing:
+                raise
+            log.warning("%s: this setting is left out: %s", self.title, error)
+            record = replace(Record.of(self, at=[], seconds=[], measures={}), held_out=-math.inf)
+        progress(self.title, 1)
+        return [record]
+
+    def _fitted(self) -> Record:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "answer.json"
             named = [
@@ -113,9 +132,8 @@ class PeerTrial(Named):
             test, reverse = numbers["test"], answer.get("test_reverse", numbers["test"])
             measures |= {"valid_best": [[numbers["valid"]]], "test": [[test]], "test_reverse": [[reverse]]}
             measures |= {"standard_error": [[answer.get("standard_error", 0.0)]]}
-        progress(self.title, 1)
         record = Record.of(self, at=[1], seconds=[numbers["seconds"]], measures=measures)
-        return [replace(record, held_out=numbers["valid"])]
+        return replace(record, held_out=numbers["valid"])
 
     def _judged(self, weights: Path) -> dict[str, float]:
         """What an RBM says of the rows."""

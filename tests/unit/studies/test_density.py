@@ -110,8 +110,11 @@ def test_peers_are_asked_and_fitted_by_their_program(tmp_path: Path) -> None:
     (reported,) = replace(trial, choosing=False).run(lambda what, n: None)
     assert reported.measures["test"] == [[-2.0]]
     assert reported.seconds == [0.5]
+    failing = replace(trial, setting='{"bias": 2}')
+    (left_out,) = failing.run(lambda what, n: None)
+    assert left_out.held_out == -math.inf
     with pytest.raises(UserError, match=r"peers.py coin: a bias of 2 is too much"):
-        replace(trial, setting='{"bias": 2}').run(lambda what, n: None)
+        replace(failing, choosing=False).run(lambda what, n: None)
 
 
 @pytest.mark.parametrize(
