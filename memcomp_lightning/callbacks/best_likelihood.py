@@ -4,11 +4,10 @@ from typing import Any, ClassVar, cast
 
 import lightning.pytorch as pl
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from memcomp_lightning.callbacks.base import iteration_of
 from memcomp_lightning.callbacks.log_likelihood import LogLikelihood
-from memcomp_lightning.errors import require_count
 from memcomp_lightning.training.best import BestPass
 
 
@@ -31,8 +30,6 @@ class BestLikelihood(LogLikelihood):
 
     def __init__(self, every: int | None = None, *, patience: int | None = None, **settings: Any) -> None:
         super().__init__(every, **settings)
-        if patience is not None:
-            require_count("patience", patience)
         self.patience = patience
         self._layer = 0
         self._best = BestPass(patience=patience)
@@ -55,9 +52,12 @@ class BestLikelihood(LogLikelihood):
             return
         model = self._model_of(pl_module)
         value = torch.tensor(newest["heldout"], dtype=torch.float64).view(getattr(model, "replicas", ()))
-        if newest["gap"]:  # of both estimates of log Z the larger one counts, which flatters no model
+        if newest["gap"] and newest["method"] == "ais":
+            # Of both estimates of log Z the larger one counts, which flatters no model.
             value += torch.tensor(newest["gap"], dtype=torch.float64).view_as(value).clamp_max(0.0)
-        self._best.offer(value, model.state_dict())
+        # Processes have estimates of their own; every one must come to the same weights.
+        shared = trainer.strategy.reduce(value.to(pl_module.device, torch.float32), reduce_op="mean")
+        self._best.offer(cast(Tensor, shared), model.state_dict())
         if self._best.over:
             trainer.should_stop = True
 
@@ -86,5 +86,5 @@ class BestLikelihood(LogLikelihood):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Inverse of :meth:`state_dict`."""
         super().load_state_dict(state_dict)
-        self._layer = int(state_dict.get("layer", 0))
-        self._best.load_state_dict(state_dict.get("best", {}))
+        self._layer = int(state_dict["layer"])
+        self._best.load_state_dict(state_dict["best"])

@@ -15,6 +15,7 @@ from torch import nn
 from memcomp_lightning.callbacks import BestLikelihood, BestWeights, LogLikelihood, Schedules, StageProgressBar
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.hydra_versions import instantiate
+from memcomp_lightning.configuration.values import require_held_out
 from memcomp_lightning.data import RowsDataModule
 from memcomp_lightning.errors import UserError, require, require_choice, require_count, require_parts
 from memcomp_lightning.modules.trainers import check_callback
@@ -111,13 +112,22 @@ def _updates_a_pass(config: DictConfig, rows: RowsDataModule) -> int:
 def with_best_likelihood(
     config: DictConfig, rows: RowsDataModule, callbacks: list[pl.Callback]
 ) -> list[pl.Callback]:
-    """The callbacks with one that keeps the best weights in the place of the one that measures likelihoods."""
+    """The callbacks; where the best weights are kept, with one that does in the place of ``LogLikelihood``."""
+    keeps, patience = config.pretrain.keep_best, config.pretrain.patience
+    if patience is not None:
+        require_count("pretrain.patience", patience)
+        remedy = "It waits for better weights, so that they are kept: pretrain.keep_best=true."
+        require(keeps, "pretrain.patience", patience, "null where pretrain.keep_best is false", remedy)
+        if not rows.holds_out:
+            require_held_out(config, "where pretrain.patience is set", "pass")
+    if not keeps:
+        return callbacks
     if not rows.holds_out:
         log.info("No rows are held out to choose the best weights of pretraining by: its last ones stay.")
         return callbacks
-    own = config.callbacks.pretrain.get("log_likelihood") or {}
+    own = (config.callbacks.pretrain or {}).get("log_likelihood") or {}
     settings = {str(name): value for name, value in own.items() if name != "_target_"}
-    best = BestLikelihood(**settings, patience=config.pretrain.patience)
+    best = BestLikelihood(**settings, patience=patience)
     return [*(callback for callback in callbacks if not isinstance(callback, LogLikelihood)), best]
 
 

@@ -116,10 +116,9 @@ def build(config: DictConfig) -> Plan:
     pretraining = finetuning = stage_for = None
     models = energy_models(network)
     if models and config.pretrain.iterations != 0:
-        callbacks, rows = callbacks_of(config, "pretrain"), rows_of_stage(config, "pretrain", data, units)
+        rows = rows_of_stage(config, "pretrain", data, units)
+        callbacks = with_best_likelihood(config, rows, callbacks_of(config, "pretrain"))
         iterations = passes_of(config, rows)
-        if config.pretrain.keep_best:
-            callbacks = with_best_likelihood(config, rows, callbacks)
         centring = part_of(config.pretrain.centring, "pretrain.centring")
         allowed = "null, or {_target_: memcomp_lightning.objective.Centring, rate: ...}"
         require(centring is None or isinstance(centring, Centring), "pretrain.centring", centring, allowed)
@@ -226,6 +225,8 @@ def classifier_of(
 def _judges(config: DictConfig, rows: RowsDataModule) -> list[BestWeights]:
     """What chooses the pass that fine-tuning ends with; nothing where it is the last one."""
     keeps, patience = config.finetune.keep_best, config.finetune.patience
+    if patience is not None:
+        require_count("finetune.patience", patience)
     judge = BestWeights(by=config.finetune.best_by, patience=patience)
     if not keeps and patience is None:
         return []

@@ -255,6 +255,11 @@ class EnergyPretraining(StageModule):
         self.pretraining.hand_over()
         self.trainer.fit_loop.min_epochs = self._fewest_passes
 
+    def on_fit_end(self) -> None:
+        """Hand over what a callback has put back where a resumed run had nothing left to train."""
+        super().on_fit_end()
+        self.pretraining.hand_over()
+
     def _let_stop(self) -> None:
         """Tell the trainer from which pass on it may stop."""
         is_last = len(self._begun_at) == len(self.phases)

@@ -14,7 +14,7 @@ Axes = dict[str, list[Any]]
 
 
 def checked_start(axes: Axes, start: Setting, at: str) -> Setting:
-    """The start, if each axis has it.
+    """The start, with the values of the axes as these have them: 1 is 1.0 on an axis of real numbers.
 
     Raises:
         SettingError: An axis has no values, or its start is none of them.
@@ -24,7 +24,7 @@ def checked_start(axes: Axes, start: Setting, at: str) -> Setting:
         require(
             start.get(name) in values, f"{at}: axis {name}", values, f"values with the start, {start.get(name)}"
         )
-    return start
+    return {**start, **{name: values[values.index(start[name])] for name, values in axes.items()}}
 
 
 def text_of(setting: Setting) -> str:

@@ -33,7 +33,7 @@ class BestPass:
 
     def __init__(self, *, patience: int | None = None, tolerance: float = 0.0) -> None:
         if patience is not None:
-            require_count("finetune.patience", patience)
+            require_count("patience", patience)
         self.patience, self.tolerance = patience, tolerance
         self.value: Tensor | None = None
         self.waited: Tensor | None = None
@@ -75,5 +75,5 @@ class BestPass:
             if not now.is_floating_point():  # indices, which no replica has of its own
                 self.weights[name] = now.clone()
                 continue
-            own = better.view((*better.shape, *[1] * (now.ndim - better.ndim)))
+            own = better.to(now.device).view((*better.shape, *[1] * (now.ndim - better.ndim)))
             self.weights[name] = torch.where(own, now, self.weights.get(name, now).to(now))

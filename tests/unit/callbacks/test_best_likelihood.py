@@ -167,3 +167,16 @@ def test_without_chains_there_is_no_gap(tmp_path: Path) -> None:
     callback = LogLikelihood(every=1)
     fitted(tmp_path, callback, sampler=CD(k=1), n_passes=2)
     assert all(value["gap"] == [] for value in callback.history)
+
+
+def test_chains_that_are_behind_do_not_change_an_exact_likelihood(tmp_path: Path) -> None:
+    class Behind(BestLikelihood):
+        def _partition_function(self, *arguments: Any) -> dict[str, torch.Tensor]:
+            found = super()._partition_function(*arguments)
+            return {**found, "log_z_gap": torch.tensor(-1e3 / (1 + len(self.history)), dtype=torch.float64)}
+
+    callback = Behind(every=1)
+    module, _, data = fitted(tmp_path, callback, sampler=PCD(n_chains=20))
+    values = [value["heldout"][0] for value in callback.history]
+    assert max(values) > values[-1]
+    assert heldout(module.models[0], data) == pytest.approx(max(values), abs=1e-4)

@@ -152,5 +152,5 @@ def test_waiting_begins_anew_by_more_than_the_tolerance_alone() -> None:
         best.offer(torch.tensor(value), {"weight": torch.tensor(float(number))})
     assert best.over
     assert best.weights["weight"] == 2
-    with pytest.raises(SettingError, match=r"finetune.patience = 0"):
+    with pytest.raises(SettingError, match=r"patience = 0"):
         BestPass(patience=0)

@@ -79,6 +79,15 @@ def test_a_setting_that_diverged_is_not_chosen() -> None:
     assert best_of(axes, start, judged) == {"a": 0}
 
 
+def test_a_whole_number_is_a_value_of_an_axis_of_real_ones() -> None:
+    axes = {"rate": [0.5, 1.0]}
+    start = checked_start(axes, {"rate": 1, "updates": 7}, "m")
+    assert [text_of(setting) for setting in missing(axes, start, {})] == [
+        text_of({"rate": rate, "updates": 7}) for rate in (0.5, 1.0)
+    ]
+    assert missing(axes, start, {text_of({"rate": rate, "updates": 7}): rate for rate in (0.5, 1.0)}) == []
+
+
 def test_a_start_that_is_no_value_of_its_axis_is_refused() -> None:
     with pytest.raises(SettingError, match=r"m: axis rate = \[1, 2\] is not allowed: .*the start, 3"):
         checked_start({"rate": [1, 2]}, {"rate": 3}, "m")
