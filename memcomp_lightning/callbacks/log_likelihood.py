@@ -269,7 +269,7 @@ def behind(gap: float) -> str:
     return (
         f"the chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing, and the "
         "likelihood falls where that goes on. Let the learning rate fall (pretrain=falling), take more chains "
-        "(sampler.n_chains=500), or chains at several temperatures (sampler=parallel_tempering)."
+        "(sampler.n_chains=500), or chains at several temperatures (sampler=tempering)."
     )
 
 

@@ -19,6 +19,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.completion_plugin import CompletionPlugin
 
+from memcomp_lightning.configuration.quoting import hydra_value, quoted, with_path
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.paths import is_path
 
@@ -208,41 +209,14 @@ def _path(name: str, text: str, *, swept: bool) -> str:
             raise UserError(f"{name}={text} matches no file in {Path.cwd()}.")
         if len(files) > 1 and not swept:
             raise UserError(f"{name}={text} stands for {len(files)} files, the jobs of a sweep: add -m.")
-        return f"{name}={','.join(map(_quoted, files))}"
+        return f"{name}={','.join(map(quoted, files))}"
     if swept and ("," in text or "(" in text):
         if re.search(r"['\"()\[\]{}]", text):
             parse(f"{name}={text}")
             return f"{name}={text}"
         paths = [expanded(name, part.strip()) for part in text.split(",")]
-        return f"{name}={','.join(map(_quoted, paths))}"
+        return f"{name}={','.join(map(quoted, paths))}"
     return with_path(name, expanded(name, text))
-
-
-def with_path(name: str, path: Path | str) -> str:
-    """An override that gives a path, in quotes unless Hydra reads it without.
-
-    >>> with_path("hydra.run.dir", "my runs/a,b")
-    "hydra.run.dir='my runs/a,b'"
-    """
-    return f"{name}={_quoted(str(path))}"
-
-
-def _quoted(text: str) -> str:
-    if hydra_value(text) == text:
-        return text
-    escaped = re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\\'", text))
-    return f"'{escaped}'"
-
-
-_UNREADABLE = object()
-
-
-def hydra_value(text: str) -> object:
-    """The value that Hydra reads; ``_UNREADABLE``, which equals no value, where it cannot read the text."""
-    try:
-        return OverridesParser.create().parse_override(f"x={text}").value()
-    except HydraException:
-        return _UNREADABLE
 
 
 def expanded(name: str, text: str) -> str:
@@ -271,7 +245,7 @@ def _absolute_search_path(override: str) -> str:
     for place in value if isinstance(value, list) else [value]:
         scheme, separator, rest = str(place).rpartition("://")
         places.append(str(place) if separator and scheme != "file" else f"file://{Path(rest).absolute()}")
-    return f"{_SEARCH_PATH}=[{','.join(map(_quoted, places))}]"
+    return f"{_SEARCH_PATH}=[{','.join(map(quoted, places))}]"
 
 
 is_file = os.path.isfile

@@ -8,11 +8,12 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli.arguments import CommandLine, expanded, parse, with_path
+from memcomp_lightning.cli.arguments import CommandLine, expanded, parse
 from memcomp_lightning.cli.output import NOT_FEASIBLE, say
 from memcomp_lightning.cli.overrides import check_command_line
 from memcomp_lightning.configuration.many_problems import Combination, answers, best_known, seen_from, tasks_of
 from memcomp_lightning.configuration.problems import PROBLEM_MISSING
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.problems import read_problem

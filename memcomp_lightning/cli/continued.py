@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from memcomp_lightning.cli.arguments import expanded, from_folder, unquoted, with_path
+from memcomp_lightning.cli.arguments import expanded, from_folder, unquoted
 from memcomp_lightning.configuration.continued import finished
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
 
 _BEGINS = ("continue", "model.weights")

@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.arguments import CommandLine, parse, with_path
+from memcomp_lightning.cli.arguments import CommandLine, parse
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.configuration.composition import (
     CONFIG_MODULE,
@@ -31,6 +31,7 @@ from memcomp_lightning.configuration.composition import (
 )
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_exists, explain
 from memcomp_lightning.configuration.hydra_versions import register_resolver
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.paths import is_path
 

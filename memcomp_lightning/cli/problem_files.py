@@ -7,7 +7,8 @@ from typing import NoReturn
 
 from hydra.core.override_parser.types import Glob
 
-from memcomp_lightning.cli.arguments import expanded, hydra_value, is_file, matching
+from memcomp_lightning.cli.arguments import expanded, is_file, matching
+from memcomp_lightning.configuration.quoting import hydra_value
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.problems import is_problem_file
 

@@ -1,6 +1,5 @@
 """``experiment=density``: energy models of tables by many negative phases, and peers, by likelihood."""
 
-import json
 import math
 import os
 import re
@@ -18,18 +17,24 @@ from memcomp_lightning.configuration.composition import (
     settings_of_comparison,
 )
 from memcomp_lightning.configuration.plans import build, check_without_trainer, plan_of
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.files import write_json
 from memcomp_lightning.studies import Record, Records, runner
 from memcomp_lightning.studies.density import Density, DensityTrial, Peer, PeerTrial, peers_of
-from memcomp_lightning.studies.plan import pretraining_of
-from memcomp_lightning.studies.search import Setting, best_of, missing, text_of
+from memcomp_lightning.studies.plan import pretraining_of, require_bits
+from memcomp_lightning.studies.search import Axes, Setting, best_of, missing, text_of
 
 CHOOSES = 1000
 """The seed by which settings are chosen; those that are reported count from 0."""
 
 _SET_BY_STUDY = {
+    "data": "Use density.folder and density.tables.",
+    "model": "Each of density.models has its own.",
+    "model.hidden_sizes": "Use density.start.hidden and density.axes.hidden.",
+    "model.n_hidden": "Use density.start.hidden and density.axes.hidden.",
+    "pretrain.updates": "Use density.start.updates and density.axes.updates.",
     "pretrain.iterations": "Use density.start.updates and density.axes.updates.",
     "pretrain.optimizer.lr": "Use density.start.rate and density.axes.rate.",
     "sampler": "Each of density.models has its own.",
@@ -56,7 +61,9 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         own = OmegaConf.create(trial.settings)
         plan = build(own)
         check_without_trainer(plan, own)
-        phases = len(pretraining_of(plan)[1].phases)
+        stage, module = pretraining_of(plan)
+        require_bits(stage.data, "seeds")
+        phases = len(module.phases)
         remedy = "A deep one is trained with pretrain=joint."
         require(phases == 1, f"density.models.{name}", f"{phases} trainings", "one of all units", remedy)
 
@@ -82,7 +89,7 @@ def _missing(
         axes, start = density.axes_of(name), density.start_of(name)
         judged = _judged(records.all, table, name)
         asked = missing(axes, start, judged)
-        for setting in asked or [best_of(axes, start, judged)]:
+        for setting in asked or _known(axes, start, judged):
             trial = trial_of(density, overrides, table, files, name, setting, choosing=bool(asked))
             if trial.key not in done:
                 yield trial
@@ -91,11 +98,17 @@ def _missing(
             judged = _judged(records.all, table, name)
             asked = missing(peer.axes, peer.start, judged)
             seeds = [CHOOSES] if asked else range(density.peer_replicas)
-            for setting in asked or [best_of(peer.axes, peer.start, judged)]:
+            for setting in asked or _known(peer.axes, peer.start, judged):
                 for seed in seeds:
                     fit = _fit(density, table, files, name, peer, setting, seed)
                     if fit.key not in done:
                         yield fit
+
+
+def _known(axes: Axes, start: Setting, judged: Mapping[str, float]) -> list[Setting]:
+    """The setting that a search chose; none where not one of those that it tried could be judged."""
+    found = best_of(axes, start, judged)
+    return [found] if judged[text_of(found)] > -math.inf else []
 
 
 def _judged(records: Sequence[Record], table: str, method: str) -> dict[str, float]:
@@ -154,7 +167,7 @@ def trial_of(
     common = (*(_filled_in(one, setting, "density.overrides") for one in density.overrides), *overrides)
     own = [_filled_in(one, setting, f"{at}.overrides") for one in model.overrides]
     keys = ("data.path", "data.validation", "data.test")
-    own += [f"{key}={json.dumps(file)}" for key, file in zip(keys, files, strict=True)]
+    own += [with_path(key, file) for key, file in zip(keys, files, strict=True)]
     first = composed_for(common, (*own, *settings_of_comparison(1)))
     plan = build(first)
     n_train, size = pretraining_of(plan)[0].data.n_train, first.pretrain.batch_size

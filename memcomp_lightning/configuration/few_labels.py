@@ -14,12 +14,11 @@ from memcomp_lightning.configuration.values import filled
 from memcomp_lightning.data.labels import n_labels
 from memcomp_lightning.errors import UserError, require, require_choice, require_parts
 from memcomp_lightning.files import write_json
-from memcomp_lightning.models.units import Bernoulli
 from memcomp_lightning.studies import Plan, Record, Records, runner
 from memcomp_lightning.studies.few_labels import FewLabels, LabelsTrial, PretrainingTrial
 from memcomp_lightning.studies.few_labels.learner import weight_file
 from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of, network_of
-from memcomp_lightning.studies.plan import images_of, pretraining_of
+from memcomp_lightning.studies.plan import images_of, pretraining_of, require_bits
 
 _SET_BY_STUDY = {
     "finetune": "Use few_labels.updates, few_labels.passes and few_labels.searches.",
@@ -76,11 +75,9 @@ def _read(config: DictConfig) -> FewLabels:
 
 def _check_data(study: FewLabels, plan: Plan) -> None:
     data = images_of(pretraining_of(plan)[0])
-    require(data.replicas == (), "data.partitions", data.replicas, "1: draws take their place")
-    require(not data.holds_out, "data.validation_fraction", "above 0", "0: cross-validation takes its place")
-    require(not data.has_gaps, "missing values", "in the images", "none")
-    units = type(data.units).__name__
-    require(isinstance(data.units, Bernoulli), "units", units, "bernoulli")
+    require_bits(data, "draws")
+    share = len(data.heldout[0]) / (len(data.heldout[0]) + data.n_train)
+    require(not data.holds_out, "data.validation_fraction", share, "0: cross-validation takes its place")
     known, n_classes = n_labels(data.train[1]), data.n_classes
     for n in study.labels:
         allowed = f"an integer from {max(n_classes, study.folds)} to {known}, or null for all {known}"

@@ -201,7 +201,8 @@ def _source() -> str:
     return digest.hexdigest()[:8]
 
 
-_FREE_TO_CHANGE = ("logger.", "checkpoint_every", "data.source.data_dir", "data.source.download", "figure.workers")
+_WORKERS = ("figure.workers", "worth.workers", "density.workers", "few_labels.workers")
+_FREE_TO_CHANGE = ("logger.", "checkpoint_every", "data.source.data_dir", "data.source.download", *_WORKERS)
 """Settings that do not change what is computed."""
 
 

@@ -4,7 +4,7 @@ import re
 
 _NAMES = re.compile(
     r"(.*\.)?(\w+_)?(problem|continue|weights|path|file|filename|dir|dirpath|folder|root)"
-    r"|data\.(source\.)?(validation|test)"
+    r"|data\.(source\.)?(validation|test)|density\.peers"
 )
 
 

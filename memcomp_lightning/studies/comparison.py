@@ -45,9 +45,16 @@ def compare(first: ArrayLike, second: ArrayLike) -> Comparison:
     error = float(difference.std(ddof=1)) / math.sqrt(n)
     if error == 0:
         return Comparison(effect, effect, effect, 1.0 if effect == 0 else 0.0, n)
-    half = float(stats.t.ppf(0.975, n - 1)) * error
+    half = half_width(difference)
     p = 2 * float(stats.t.sf(abs(effect) / error, n - 1))
     return Comparison(effect, effect - half, effect + half, p, n)
+
+
+def half_width(values: ArrayLike) -> float:
+    """Of the 95 % interval of a mean, by Student's t; NaN of one value."""
+    own = np.asarray(values, dtype=float)
+    n = len(own)
+    return math.nan if n < 2 else float(stats.t.ppf(0.975, n - 1) * own.std(ddof=1) / math.sqrt(n))
 
 
 def accounts_for(control: ArrayLike, better: ArrayLike, gain: Comparison) -> bool:

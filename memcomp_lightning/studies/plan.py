@@ -12,6 +12,7 @@ from memcomp_lightning.callbacks import BestWeights
 from memcomp_lightning.data import ImageDataModule, RowsDataModule
 from memcomp_lightning.errors import require
 from memcomp_lightning.models import DBN, Randomiser
+from memcomp_lightning.models.units import Bernoulli
 from memcomp_lightning.modules import Classifier, EnergyPretraining, StageModule, UpDown
 from memcomp_lightning.studies.records import Named
 from memcomp_lightning.training import Batches, Pass, PretrainingStage, finetune, pretrain
@@ -162,6 +163,22 @@ def pretraining_of(plan: Plan) -> tuple[Stage, EnergyPretraining]:
     assert stage is not None
     assert isinstance(stage.module, EnergyPretraining)
     return stage, stage.module
+
+
+def require_bits(data: RowsDataModule, place: str) -> None:
+    """Refuse rows that a study of bits cannot take.
+
+    Args:
+        data: Its rows.
+        place: What the study has in the place of replicas.
+
+    Raises:
+        SettingError: They have replicas, missing values or units of another kind.
+    """
+    require(data.replicas == (), "data.partitions", data.replicas, f"1: {place} take their place")
+    require(not data.has_gaps, "missing values", f"in {data.data_name}", "none")
+    units = type(data.units).__name__
+    require(isinstance(data.units, Bernoulli), "units", units, "Bernoulli, which are 0 or 1")
 
 
 def images_of(stage: Stage) -> ImageDataModule:

@@ -1,6 +1,7 @@
 """``experiment=density`` in small: the search, a peer, resume, report, and what is refused."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,6 +100,15 @@ def test_settings_are_searched_and_reported_once_and_a_run_goes_on(memcomp_train
     assert len(again) == len(found)
 
 
+def test_what_fits_nowhere_is_left_out_and_the_others_are_reported(memcomp_train: Run, here: Path) -> None:
+    Path("coin.py").write_text(COIN.replace("bias = json", "sys.exit('no bias fits')\nbias = json"))
+    outcome = memcomp_train(*(o for o in SMALL if "only" not in o), "density.only=[cd1,coin]")
+    assert outcome.status == 0, outcome.err
+    assert {record.method for record in records() if not record.choosing} == {"cd1"}
+    assert {record.held_out for record in records() if record.method == "coin"} == {-math.inf}
+    assert "no bias fits" in Path("run/train.log").read_text()
+
+
 @pytest.mark.parametrize(
     ("typed", "said"),
     [
@@ -107,6 +117,10 @@ def test_settings_are_searched_and_reported_once_and_a_run_goes_on(memcomp_train
         ("density.replicas=0", "density.replicas = 0"),
         ("density.models.cd1.overrides=['model.hidden_sizes=[{width}]']", "setting = 'width' is not allowed"),
         ("pretrain.iterations=5", "Use density.start.updates"),
+        ("pretrain.updates=5", "Use density.start.updates"),
+        ("model.hidden_sizes=[5]", "Use density.start.hidden"),
+        ("data=table", "Use density.folder"),
+        ("data.partitions=2", "data.partitions = (2,)"),
         ("sampler=cd", "Each of density.models has its own"),
         ("density.peers=nothing.py", "nothing.py"),
         ("density.models.cd1.overrides=['model.hidden_sizes=[3,3]']", "trained with pretrain=joint"),

@@ -129,7 +129,10 @@ def test_class_weights_reach_the_loss() -> None:
         (["finetune.patience=0", "data.validation_fraction=0.2"], "finetune.patience = 0"),
         (["pretrain.patience=2"], r"pretrain.patience = 2 .*pretrain.keep_best=true"),
         (["pretrain.patience=0"], "pretrain.patience = 0"),
-        (["pretrain.patience=2", "pretrain.keep_best=true"], r"data.validation_fraction = 0.0 .*pretrain.patience"),
+        (
+            ["pretrain.patience=2", "pretrain.keep_best=true"],
+            r"data.validation_fraction = 0.0 .*pretrain.patience",
+        ),
         (["finetune.best_by=auc", "finetune.keep_best=true"], "finetune.best_by = 'auc'"),
         (["finetune.class_weights=equal"], r"finetune.class_weights = 'equal' .*balanced.*9 numbers > 0"),
         (["finetune.class_weights=[1,2]"], r"finetune.class_weights = \[1, 2\] .*0, 1, 2"),

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 
 from memcomp_lightning.cli import batch
-from memcomp_lightning.cli.arguments import read, with_path
+from memcomp_lightning.cli.arguments import read
 from memcomp_lightning.cli.output import NOT_FEASIBLE, make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line
 from memcomp_lightning.cli.problem_files import problem_files
 from memcomp_lightning.configuration.composition import CONFIG_MODULE
 from memcomp_lightning.configuration.hydra_versions import MAIN
 from memcomp_lightning.configuration.problems import prepare
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.problems import Problem, ProblemFileError, in_full

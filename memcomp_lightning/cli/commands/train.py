@@ -18,7 +18,7 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli import sweep
-from memcomp_lightning.cli.arguments import CommandLine, expanded, from_folder, read, unquoted, with_path
+from memcomp_lightning.cli.arguments import CommandLine, expanded, from_folder, read, unquoted
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.continued import with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
@@ -31,6 +31,7 @@ from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
 from memcomp_lightning.configuration.plans import build, check_without_trainer
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.configuration.trainers import check_trainers, trainer_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from memcomp_lightning.studies.comparison import half_width
 from memcomp_lightning.studies.density.peers import Peer
 from memcomp_lightning.studies.density.settings import Density, Model
 from memcomp_lightning.studies.records import Record, Records
@@ -61,10 +62,7 @@ class Found(NamedTuple):
     @property
     def half_width(self) -> float:
         """Of the 95 % interval of the mean over seeds (t distribution); NaN of one seed."""
-        n = len(self.test)
-        if n < 2:
-            return math.nan
-        return float(stats.t.ppf(0.975, n - 1) * self.test.std(ddof=1) / math.sqrt(n))
+        return half_width(self.test)
 
 
 class Densities:
@@ -104,12 +102,7 @@ class Densities:
 
         up, down = last("test"), last("test_reverse")
         n_seeds = len(up)
-        at = [int(record.measured("valid").mean(1).argmax()) for record in own]
-        train = [
-            record.measured("train")[i].mean()
-            for record, i in zip(own, at, strict=True)
-            if "train" in record.measures
-        ]
+        train = [_at_best(record, "train") for record in own if "train" in record.measures]
         tried = {record.setting for record in self._records[table, method] if record.choosing}
         return Found(
             setting=json.loads(own[0].setting),
@@ -118,7 +111,7 @@ class Densities:
             gap=float((up - down)[np.abs(up - down).argmax()]),
             standard_error=float(last("standard_error").max()),
             valid=float(last("valid_best").mean()),
-            train=float(np.mean(train)) if train else math.nan,
+            train=float(np.concatenate(train).mean()) if train else math.nan,
             independent=float(last("independent").mean()),
             seconds=sum(record.seconds[-1] for record in own) / n_seeds,
             tried=len(tried),
@@ -212,12 +205,22 @@ def density_table(results: Densities) -> list[list[str]]:
         if independent:
             rows.append([table, "independent bits", f"{independent[0]:.3f}", *[""] * 9])
         for name, own in found.items():
-            cells = [f"{own.half_width:.3f}", str(len(own.test)), f"{own.gap:.3f}", f"{own.standard_error:.3f}"]
-            measured = [f"{own.valid:.3f}", f"{own.train:.3f}", f"{own.seconds:.1f}"]
+            cells = [_number(own.half_width), str(len(own.test)), _number(own.gap), _number(own.standard_error)]
+            measured = [_number(own.valid), _number(own.train), f"{own.seconds:.1f}"]
             chosen = " ".join(f"{key}={value}" for key, value in own.setting.items())
             value = f"{own.mean:.3f}" if own.known else "not known"
             rows.append([table, results.label(name), value, *cells, *measured, chosen, str(own.tried)])
-    return [[cell.replace("nan", "") for cell in row] for row in rows]
+    return rows
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.3f}"
+
+
+def _at_best(record: Record, name: str) -> NDArray[np.float64]:
+    """A measure of each seed where its held-out rows were most likely, whose weights are kept."""
+    at = record.measured("valid").argmax(0, keepdims=True)
+    return np.take_along_axis(record.measured(name), at, 0)[0]
 
 
 def read_densities(folder: Path) -> Densities:

@@ -19,7 +19,7 @@ from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.density.settings import Density
 from memcomp_lightning.studies.likelihood import warm_up
 from memcomp_lightning.studies.measures.gradient_bias import without_diverged
-from memcomp_lightning.studies.plan import Trial, passes_without_trainer, pretraining_of
+from memcomp_lightning.studies.plan import Trial, passes_without_trainer, pretraining_of, require_bits
 from memcomp_lightning.studies.records import Record
 from memcomp_lightning.training import DivergedError
 from memcomp_lightning.training.best import BestPass
@@ -82,6 +82,7 @@ class DensityTrial(Trial):
         """
         plans = [self.build({**self.settings, "seed": seed}) for seed in self.seeds]
         stage, module = pretraining_of(plans[0])
+        require_bits(stage.data, "seeds")
         network, data = stacked([plan.network for plan in plans], ()), stage.data
         batches = data.train_batches(0, 1).repeated(self.seeds)
         assert plans[0].stage_for is not None
@@ -118,7 +119,7 @@ class DensityTrial(Trial):
             pass
         progress(self.title, self.points[-1] - reported)
         if best.value is None:
-            return [replace(record, held_out=-math.inf)]
+            return [self._diverged(record, time.process_time() - begin)]
         record = replace(record, held_out=float(best.value.median()))
         if self.choosing:
             return [record]
@@ -129,6 +130,15 @@ class DensityTrial(Trial):
         found = {"test": scores[0].up, "test_reverse": scores[0].down, "standard_error": scores[0].standard_error}
         found |= {"valid_best": scores[1].least, "independent": base.expand_as(scores[0].up)}
         return [replace(record, measures={**measured, **{name: [x.tolist()] for name, x in found.items()}})]
+
+    def _diverged(self, record: Record, seconds: float) -> Record:
+        """What is left of a training that diverged before it was measured: it loses."""
+        unknown = [[math.nan] * len(self.seeds)]
+        measures = dict.fromkeys(("valid", "train", "log_z_gap"), unknown)
+        if not self.choosing:
+            names = ("test", "test_reverse", "standard_error", "valid_best", "independent")
+            measures |= dict.fromkeys(names, unknown)
+        return replace(record, held_out=-math.inf, at=[0], seconds=[seconds], measures=measures)
 
 
 @torch.no_grad()

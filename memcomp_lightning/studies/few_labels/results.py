@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from memcomp_lightning.studies.comparison import Comparison, accounts_for, compare
+from memcomp_lightning.studies.comparison import Comparison, accounts_for, compare, half_width
 from memcomp_lightning.studies.few_labels.settings import BEST, Claim, FewLabels, Method, Pretraining, Search
 from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of
 from memcomp_lightning.studies.records import Record, Records
@@ -46,10 +45,7 @@ class Found(NamedTuple):
     @property
     def half_width(self) -> float:
         """Of the 95 % interval of the mean over draws (t distribution); NaN of one draw."""
-        n = len(self.accuracy)
-        if n < 2:
-            return math.nan
-        return float(stats.t.ppf(0.975, n - 1) * self.accuracy.std(ddof=1) / math.sqrt(n))
+        return half_width(self.accuracy)
 
 
 class Accuracies:
@@ -83,7 +79,8 @@ class Accuracies:
         chosen = [json.dumps(chosen_of(record)) for record in records]
         return Found(
             accuracy=np.array([_accuracy(record) for record in records]),
-            cross_validated=float(np.mean([record.measures["cross_validated"][0][0] for record in records])),
+            # Where every setting diverged nothing was judged: such a draw counts as chance would at best, 0.
+            cross_validated=float(np.nan_to_num([_cross_validated(record) for record in records]).mean()),
             chosen=json.loads(max(chosen, key=chosen.count)),
             tried=float(np.mean([record.measures["tried"][0][0] for record in records])),
             seconds=float(np.mean([record.seconds[-1] for record in records])),
@@ -99,6 +96,10 @@ class Accuracies:
         own = [self._records.get((n, method), {}) for method in methods]
         draws = sorted(set.intersection(*(set(records) for records in own)))
         return [np.array([_accuracy(records[draw]) for draw in draws]) for records in own]
+
+
+def _cross_validated(record: Record) -> float:
+    return record.measures["cross_validated"][0][0]
 
 
 def _accuracy(record: Record) -> float:
@@ -138,11 +139,14 @@ def worth_note(results: Accuracies) -> str:
     worth, others = list[str](), list[str]()
     for n in results.labels:
         own = [verdict.verdict == HOLDS for line, verdict in judged if line.n == n]
-        if own:
-            holds = len(own) == len(results.plan.worth) and all(own)
-            (worth if holds else others).append(f"{results.n_labels(n):,}")
+        if not all(own):
+            others.append(f"{results.n_labels(n):,}")
+        elif len(own) == len(results.plan.worth):  # else some are not measured yet
+            worth.append(f"{results.n_labels(n):,}")
     opponents = " and ".join(_label(results, name.replace(BEST, "its")) for name in results.plan.worth)
     rest = f"; it is not with {', '.join(others)}" if others else ""
+    if not worth and not others:
+        return f"Whether the best pretraining is above {opponents} is not measured yet."
     if not worth:
         return f"With no number of labels is the best pretraining above {opponents}."
     return f"With {', '.join(worth)} labels the best pretraining is above {opponents}{rest}."
@@ -150,9 +154,10 @@ def worth_note(results: Accuracies) -> str:
 
 def _judged(results: Accuracies) -> list[tuple[_Line, Verdict]]:
     lines = [line for n in results.labels for claim in results.plan.claims if (line := _line(results, n, claim))]
-    tested = [line for line in lines if not math.isnan(line.gain.p)]
-    adjusted = dict(zip(map(id, tested), holm([line.gain.p for line in tested]), strict=True))
-    return [(line, _verdict(results, line, adjusted.get(id(line), math.nan))) for line in lines]
+    adjusted = iter(holm([line.gain.p for line in lines if not math.isnan(line.gain.p)]))
+    return [
+        (line, _verdict(results, line, math.nan if math.isnan(line.gain.p) else next(adjusted))) for line in lines
+    ]
 
 
 def _line(results: Accuracies, n: Labels, claim: Claim) -> _Line | None:

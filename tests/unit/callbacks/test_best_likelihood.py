@@ -160,7 +160,7 @@ def test_a_warning_names_the_remedy_where_chains_stay_behind(
     if at is not None:
         assert said[0].startswith(f"pretrain/layer1, {at}: ")
         assert "pretrain=falling" in said[0]
-        assert "sampler=parallel_tempering" in said[0]
+        assert "sampler=tempering" in said[0]
 
 
 def test_without_chains_there_is_no_gap(tmp_path: Path) -> None:

@@ -175,6 +175,22 @@ def test_what_is_reported_is_the_lower_estimate_and_no_number_where_they_disagre
     assert set(density_figures(results)) == {"density", "density_t"}
 
 
+def test_training_rows_are_those_of_the_weights_that_each_seed_keeps() -> None:
+    own = record("cd1", [-5.0, -5.0])
+    own.measures["valid"] = [[-1.0, -9.0], [-math.inf, -2.0]]
+    own.measures["train"] = [[-0.5, -8.0], [math.nan, -1.5]]
+    assert Densities(density(), {}, [own]).of("t")["cd1"].train == -1.0
+
+
+def test_a_table_keeps_its_letters_and_lacks_what_is_unknown() -> None:
+    own = replace(record("cd1", [-5.0]), data_set="finance")
+    rows = density_table(Densities(density(tables=["finance"]), {}, [own]))
+    assert [row[:4] for row in rows[1:]] == [
+        ["finance", "independent bits", "-9.000", ""],
+        ["finance", "CD1", "-5.000", ""],
+    ]
+
+
 def test_verdicts_count_peers_and_correct_for_the_number_of_lines() -> None:
     plan = density(replicas=3)
     peers = {name: Peer(label=name, axes={}, start={}) for name in ("worse", "better")}

@@ -1,5 +1,6 @@
 """A study of few labels: who sees which labels, what is chosen by them, and what its verdicts say."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -354,9 +355,25 @@ def test_verdicts_are_paired_corrected_and_explained_by_controls() -> None:
     assert worth_note(results) == (
         "With 15 labels the best pretraining is above BN and its shuffled; it is not with 60."
     )
+    unfinished = Accuracies(study(claims=CLAIMS), unfinished_records())
+    assert worth_note(unfinished) == "With no number of labels is the best pretraining above BN and its shuffled."
+    unfinished = Accuracies(study(claims=CLAIMS), [one for one in unfinished_records() if one.labels == 15])
+    assert (
+        worth_note(unfinished) == "Whether the best pretraining is above BN and its shuffled is not measured yet."
+    )
     explained = few_labels_verdicts(Accuracies(study(claims=CLAIMS), records([0.89, 0.92, 0.90, 0.92])))
     assert explained[0].verdict == "holds only without controls"
     assert explained[0].explained_by == ("PCD_SHUFFLED",)
+
+
+def unfinished_records() -> list[Record]:
+    return [one for one in records() if "shuffled" not in one.method]
+
+
+def test_a_draw_of_which_nothing_could_be_judged_chooses_nothing() -> None:
+    found = [record("cd", 15, draw, 0.5, math.nan if draw == 0 else 0.5) for draw in range(4)]
+    results = Accuracies(study(claims=CLAIMS), [*found, record("pcd", 15, 0, 0.9, 0.6)])
+    assert results.best(15) == "pcd"
 
 
 def test_only_draws_that_both_have_are_compared() -> None:
