@@ -55,7 +55,7 @@ def train(samplers: list[str], tables: list[str] | None) -> None:
         setting = dict(zip(AXES, values, strict=True))
         trial = trial_of(density, [], table, files_of(density, table), sampler, setting, choosing=True)
         (record,) = trial.run(lambda what, n: None)
-        valid = record.measured("valid")[:, 0] if record.at else np.array([-np.inf])
+        valid = np.nan_to_num(record.measured("valid")[:, 0], nan=-np.inf)
         train, held_out, _ = map(read_rows, files_of(density, table))
         start = float(independent_bits(train, held_out))
         numbers = [f"{valid.max():.4f}", f"{valid[-1]:.4f}", f"{start:.4f}", f"{record.seconds[-1]:.2f}"]

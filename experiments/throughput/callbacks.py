@@ -9,7 +9,6 @@ and the two are weighted by its interval. What Lightning's logging and TensorBoa
 """
 
 import argparse
-import importlib.util
 import logging
 import statistics
 import tempfile
@@ -47,10 +46,9 @@ ANY_SIZE: list[Make] = [
     ours.ChainPictures,
     ours.SaturationGuard,
     ours.TrajectoryFigure,
+    ours.LogLikelihood,
 ]
 ENUMERATED: list[Make] = [ours.GradientBias]
-if importlib.util.find_spec("memcomp_lightning.likelihood") is not None:
-    ANY_SIZE.append(ours.LogLikelihood)
 
 
 class PassTimes(pl.Callback):

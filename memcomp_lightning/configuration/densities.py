@@ -100,7 +100,7 @@ def _missing(
             seeds = [CHOOSES] if asked else range(density.peer_replicas)
             for setting in asked or _known(peer.axes, peer.start, judged):
                 for seed in seeds:
-                    fit = _fit(density, table, files, name, peer, setting, seed)
+                    fit = _fit(density, table, files, name, setting, seed)
                     if fit.key not in done:
                         yield fit
 
@@ -132,9 +132,7 @@ def _peers(density: Density) -> dict[str, Peer]:
     return peers_of(density.peers_python or sys.executable, density.peers)
 
 
-def _fit(
-    density: Density, table: str, files: Files, name: str, peer: Peer, setting: Setting, seed: int
-) -> PeerTrial:
+def _fit(density: Density, table: str, files: Files, name: str, setting: Setting, seed: int) -> PeerTrial:
     assert density.peers is not None
     return PeerTrial(
         method=name,
@@ -142,7 +140,6 @@ def _fit(
         setting=text_of(setting),
         seed=seed,
         choosing=seed == CHOOSES,
-        label=peer.label,
         python=density.peers_python or sys.executable,
         program=density.peers,
         files=files,

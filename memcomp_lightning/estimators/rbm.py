@@ -176,7 +176,6 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
 
     def _begin(self, samples: Samples, seed: int, n_passes: int | None = None) -> None:
         """Draw weights; the rate falls over ``n_passes``, and stays where None is given."""
-        falls = n_passes is not None and self.last_rate < 1
         dbn = dbn_for(samples.X, [int(self.n_components)], std=WEIGHT_STD, generator=rng.stream(seed, "weights"))
         rbm = dbn[0]
         self._base = log_odds_of(samples).to(rbm.b)
@@ -186,7 +185,7 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
             Greedy(dbn).phases[0],
             self._negative_phase(),
             optimizer=self._optimizer(),
-            schedules=[LearningRateDecay(n_passes, self.last_rate)] if falls and n_passes else [],
+            schedules=[LearningRateDecay(n_passes, self.last_rate)] if n_passes and self.last_rate < 1 else [],
             centring=self._centring(),
             streams=rng.streams(seed, ("negative_phase", "positive_phase")),
         )

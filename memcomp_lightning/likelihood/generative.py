@@ -49,13 +49,12 @@ def recognition_bound(
         SettingError: v has values that the units do not take, or the wrong shape.
     """
     require_count("n_draws", n_draws, minimum=2)
-    n = model.n_below if not model.generative else model.visible.n
+    n = model.visible.n
     fits = v.ndim >= 2 and v.shape[-1] == n and v.shape[:-2] in ((), model.replicas)
     require(
         fits, "shape of v", tuple(v.shape), f"(n, {n}), or with the replica axes {model.replicas} in front of it"
     )
-    if model.generative:
-        model.visible.check(v, pure=True)
+    model.visible.check(v, pure=True)
     wide = copy.deepcopy(model).double()
     v = v.double().expand(*model.replicas, *v.shape[-2:])
     parts = [_log_weights(wide, rows, n_draws, generator) for rows in v.split(ROWS, dim=-2)]

@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 
-from memcomp_lightning.errors import SettingError, require, require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import PerState, Readout, Visible
-from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.models.conditional import Conditional
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.rbm import RBM
@@ -83,8 +82,10 @@ class GenerativeDBN(nn.Module):
 
     @property
     def visible(self) -> Units:
-        """The kind of the inputs; of a single RBM the labels are among them."""
-        return self.downward[0].units if self.generative else self.top.visible
+        """The kind of the inputs, without labels."""
+        if self.generative:
+            return self.downward[0].units
+        return self.top.visible.select(torch.arange(self.n_below, device=self.top.b.device))
 
     @property
     def replicas(self) -> tuple[int, ...]:
@@ -121,14 +122,20 @@ class GenerativeDBN(nn.Module):
 
     def with_label(self, x: Tensor, label: Int[Tensor, "*axes n"]) -> Tensor:
         """Visible states of the top RBM: x, and beside it what says the class, if the model has labels."""
-        if not self.n_classes:
-            return x
+        return self._beside(x, self._label_units(x, label)) if self.n_classes else x
+
+    def _label_units(self, x: Tensor, label: Tensor) -> Tensor:
+        """What says the class of each row of x, ``(*axes, n, n_classes)``."""
         wrong = (label < 0) | (label >= self.n_classes)
         found = int(label[wrong][0]) if bool(wrong.any()) else 0
         allowed = f"an integer from 0 to {self.n_classes - 1} of each row, as labels are units of the model"
         require(not bool(wrong.any()), "label", found, allowed)
-        one_hot = torch.nn.functional.one_hot(label, self.n_classes).to(x)
-        return torch.cat((x, one_hot.expand(*x.shape[:-1], self.n_classes)), dim=-1)
+        n = x.shape[-2]
+        require(label.shape[-1] == n, "length of label", label.shape[-1], f"{n}, one of each row")
+        return torch.nn.functional.one_hot(label, self.n_classes).to(x)
+
+    def _beside(self, x: Tensor, label_units: Tensor) -> Tensor:
+        return torch.cat((x, label_units.expand(*x.shape[:-1], self.n_classes)), dim=-1)
 
     # ---------------------------------------------------------------------------------------------- reading off
 
@@ -153,15 +160,19 @@ class GenerativeDBN(nn.Module):
         """
         require_count("n", n)
         require_count("sweeps", sweeps)
-        if label is not None and not self.n_classes:
-            raise SettingError("label = given is not allowed: expected None, as this model has no labels.")
+        remedy = "This model has no labels."
+        require(label is None or self.n_classes > 0, "label", "a tensor", "None", remedy)
         x = self.top.chains().random(n, generator=generator)
+        held = None if label is None else self._label_units(x, label.to(x.device))
+        h = None
         for _ in range(sweeps):
-            x = sweep(self.top, self._held(x, label), generator=generator)
+            x = x if held is None else self._beside(x[..., : self.n_below], held)
+            h = self.top.draw_hidden(x, generator=generator)
+            x = self.top.draw_visible(h, generator=generator)
+        if visible == "mean" and not self.generative:
+            assert h is not None
+            return self.top.visible_mean(h)[..., : self.n_below]
         return self.down(x, visible=visible, generator=generator)[0]
-
-    def _held(self, x: Tensor, label: Tensor | None) -> Tensor:
-        return x if label is None else self.with_label(x[..., : self.n_below], label.to(x.device))
 
     def log_weights_of_labels(self, x: Tensor) -> Float[Tensor, "*replicas n n_classes"]:
         """Log of the unnormalised probability of states below the top with each label, in the top RBM."""

@@ -156,7 +156,7 @@ def up_down(
         found: list[Tensor] = []
         n_updates = 0
         with with_gradient():
-            for batch in updates_of(batches, model.visible if model.generative else None):
+            for batch in updates_of(batches, model.visible):
                 losses, state = step.add_gradient(model, batch, state, streams=streams)
                 found.append(torch.stack(losses) * batch.share)
                 if batch.closes_step:

@@ -322,6 +322,19 @@ def test_means_are_shown_of_the_inputs_alone():
     torch.testing.assert_close(states[0], model.generative[0].mean(states[1]))
 
 
+def test_means_of_a_single_rbm_are_those_of_its_conditionals():
+    model = model_of(2, sizes=(N_TOP,))
+    label = torch.zeros(4000, dtype=torch.long)
+    means, draws = (
+        model.samples(4000, sweeps=5, label=label, visible=visible, generator=rng.stream(0, "samples"))
+        for visible in ("mean", "sample")
+    )
+    assert means.shape == draws.shape == (4000, N)
+    assert ((means > 0) & (means < 1)).all()
+    # The last draws of both have the same hidden units.
+    torch.testing.assert_close(means.mean(0), draws.mean(0), atol=0.03, rtol=0)
+
+
 # Persistent chains lag behind a model of three rows that moves fast.
 @pytest.mark.parametrize(
     ("sampler", "replicas", "rate", "iterations"),
@@ -371,3 +384,8 @@ def test_what_cannot_be_is_refused():
         recognition_bound(model, ROWS / 2, log_z, generator=rng.stream(0, "x"))
     with pytest.raises(SettingError, match="shape of v"):
         recognition_bound(model, ROWS[:, :2], log_z, generator=rng.stream(0, "x"))
+    with pytest.raises(SettingError, match="length of label = 3"):
+        model.samples(4, sweeps=1, label=torch.zeros(3, dtype=torch.long), generator=rng.stream(0, "x"))
+    single = model_of(2, sizes=(N_TOP,))
+    with pytest.raises(SettingError, match="v in column"):
+        recognition_bound(single, ROWS / 2, log_z, generator=rng.stream(0, "x"))

@@ -71,20 +71,21 @@ class PeerTrial(Named):
     """A fit of a peer.
 
     Attributes:
-        label: For people.
         python, program: What runs it.
         files: Of training, held-out and test rows.
         betas, chains: Of AIS, where the peer is an RBM.
-        n_updates: Of the progress bar.
     """
 
-    label: str
     python: str
     program: str
     files: tuple[str, str, str]
     betas: int
     chains: int
-    n_updates: int = 1
+
+    @property
+    def n_updates(self) -> int:
+        """Of the progress bar: it counts fits."""
+        return 1
 
     @property
     def title(self) -> str:

@@ -134,9 +134,9 @@ DENSITY_RULE = (
 )
 
 
-def density_verdicts(results: Densities, baselines: Sequence[str] = ("cd1", "cd10", "pcd")) -> list[Verdict]:
+def density_verdicts(results: Densities) -> list[Verdict]:
     """Against the peers, a line a table; of the negative phases, a line a table and phase."""
-    return [*_against_peers(results), *_of_phases(results, baselines)]
+    return [*_against_peers(results), *_of_phases(results)]
 
 
 def _against_peers(results: Densities) -> list[Verdict]:
@@ -159,8 +159,8 @@ def _against_peers(results: Densities) -> list[Verdict]:
     return lines
 
 
-def _of_phases(results: Densities, baselines: Sequence[str]) -> list[Verdict]:
-    pairs = []
+def _of_phases(results: Densities) -> list[Verdict]:
+    pairs, baselines = [], results.plan.baselines
     for table in results.tables:
         found = results.of(table)
         basic = {name: found[name] for name in baselines if name in found}
@@ -219,8 +219,9 @@ def _number(value: float) -> str:
 
 def _at_best(record: Record, name: str) -> NDArray[np.float64]:
     """A measure of each seed where its held-out rows were most likely, whose weights are kept."""
-    at = record.measured("valid").argmax(0, keepdims=True)
-    return np.take_along_axis(record.measured(name), at, 0)[0]
+    at = record.measured("valid").argmax(0)
+    found: NDArray[np.float64] = record.measured(name)[at, np.arange(len(at))]
+    return found
 
 
 def read_densities(folder: Path) -> Densities:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from memcomp_lightning.errors import require, require_count, require_some
+from memcomp_lightning.errors import require, require_choice, require_count, require_some
 from memcomp_lightning.studies.search import Axes, Setting, checked_start
 
 
@@ -45,6 +45,7 @@ class Density:
     axes: Axes
     start: Setting
     models: dict[str, Model]
+    baselines: list[str]
     peers: str | None
     peers_python: str | None
     workers: int | None
@@ -55,6 +56,8 @@ class Density:
         require_count("density.chains", self.chains, minimum=2)
         require_some("density.tables", self.tables, "names of tables")
         require_some("density.only", self.only, "names of models and peers, or null for all")
+        for name in self.baselines:
+            require_choice("density.baselines", name, tuple(self.models))
         for name in self.models:
             at = f"density.models.{name}.start"
             require("updates" in self.start_of(name), at, self.models[name].start, "one with updates, a number")

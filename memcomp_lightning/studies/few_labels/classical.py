@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from memcomp_lightning.data.labels import labelled_at
 from memcomp_lightning.studies.few_labels.data import Sets
 from memcomp_lightning.studies.few_labels.learner import Given, Point
 from memcomp_lightning.studies.search import Setting
@@ -117,6 +118,4 @@ class SupportVectors(Classical):
 
 def _spread(label: Tensor, most: int | None) -> Tensor:
     """Places of at most so many rows, of each class its share."""
-    from memcomp_lightning.data.labels import labelled_at
-
     return labelled_at(label, len(label) if most is None else min(most, len(label)))

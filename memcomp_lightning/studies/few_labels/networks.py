@@ -1,6 +1,7 @@
 """Networks that are trained by back-propagation: what they start from, and their training side by side."""
 
 import contextlib
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -40,7 +41,7 @@ class Pretrained:
 
     def network(self, given: Given, n_classes: int) -> nn.Module:
         """DBN and output layer, whose weights are N(0, 0.01^2)."""
-        dbn = given.blank if self.of is None else given.pretrained(self.of)
+        dbn = copy.deepcopy(given.blank) if self.of is None else given.pretrained(self.of)
         if self.change is not None:
             self.change(dbn, generator=rng.stream(given.seed, "between stages"))
         own = rng.stream(given.seed, "output weights")

@@ -112,6 +112,13 @@ class FewLabels:
         require(fits, "few_labels.batch_sizes", sizes, "the fewest and the most rows of an update")
         for name in self.only or ():
             require_choice("few_labels.only", name, tuple(self.methods))
+        for name in self.candidates:
+            require_choice("few_labels.candidates", name, tuple(self.methods))
+        for claim in self.claims:
+            for name in (claim.better, claim.than, *claim.controls):
+                self._check_named("few_labels.claims", name)
+        for name in self.worth:
+            self._check_named("few_labels.worth", name)
         for name, method in self.methods.items():
             at = f"few_labels.methods.{name}"
             require_choice(f"{at}.search", method.search, tuple(self.searches))
@@ -122,6 +129,11 @@ class FewLabels:
                 missing = self.takes(name) and not self.takes(method.after)
                 remedy = f"It goes on from {method.after}: name both."
                 require(not missing, "few_labels.only", self.only, f"a list with {method.after}", remedy)
+
+    def _check_named(self, at: str, name: str) -> None:
+        """A name in a claim must be that of a method, with each candidate in the place of the best one."""
+        for candidate in self.candidates:
+            require_choice(at, name.replace(BEST, candidate), tuple(self.methods))
 
     @property
     def lengths(self) -> Lengths:

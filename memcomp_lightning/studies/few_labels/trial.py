@@ -122,11 +122,10 @@ class LabelsTrial(Trial):
         folds = folded(rows, own, self.study.n_folds(len(own.at)), data.n_classes, draw)
         search = self.study.searches[self.study.methods[self.method].search]
         chosen = cross_validated(self.learner, given, folds, search.axes, search.start)
-        tuned = time.process_time() - begin
         everything = whole(rows, own, test, data.n_classes, draw)
         points = self.learner.learn(given, everything, chosen.setting, (chosen.passes,))
         accuracy = float(points[-1].accuracy[0]) if points else 0.0
-        measures = {"test_accuracy": [[accuracy]], "cross_validated": [[chosen.accuracy]], "tuning": [[tuned]]}
+        measures = {"test_accuracy": [[accuracy]], "cross_validated": [[chosen.accuracy]]}
         measures |= {"labels": [[float(len(own.at))]]}
         measures |= {"tried": [[float(chosen.tried)]], f"{CHOSEN}passes": [[float(chosen.passes)]]}
         measures |= {f"{CHOSEN}{name}": [[float(value)]] for name, value in chosen.setting.items()}
