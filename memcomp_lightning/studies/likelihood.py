@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -72,24 +72,17 @@ class LikelihoodTrial(Trial):
         warm_up(joint_model(network), module, next(iter(batches)).v)
         measure, seconds = MEASURES[self.comparison.data_sets[self.data_set].measure], 0.0
         score = measure.make(images_of(stage), n_reported)
-        begin, reported = time.process_time(), 0
         passes, present_model = _training(self, plans[0], network, batches)
         names = ["score", "reverse"][: 1 + measure.both_ways]
         measures: Measures = {name: [] for name in (*names, "cosine", "relative_error")}
         record = Record.of(self, at=[], seconds=[], measures=measures)
         updates_a_pass = sum(batch.closes_step for batch in batches)
         try:
-            for done in passes:
-                if done.number not in self.points:
-                    continue
-                seconds += time.process_time() - begin
-                progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
-                reported = done.number
+            for done, seconds in measured_passes(passes, self.points, progress, self.title):
                 model, diverged = without_diverged(present_model())
                 scores = [x.double().masked_fill(diverged, math.inf) for x in score(model) if x is not None]
                 bias = gradient_bias(model, module.sampler, done, self.comparison.gradient_draws)
                 _add(record, done.number * updates_a_pass, seconds, [x.tolist() for x in (*scores, *bias)])
-                begin = time.process_time()
         except (DivergedError, SettingError):  # the second is a solver's that is given NaN
             worst, nothing = [math.inf] * n_replicas, [math.nan] * n_replicas
             measured = record.at[-1] if record.at else 0
@@ -132,6 +125,26 @@ def _training(
         for after in passes_without_trainer(module, batches, stage=stage)
     )
     return passes, lambda: stage.phases[0].model if len(stage.phases) == 1 else joint_model(network)
+
+
+def measured_passes(
+    passes: Iterable[Pass], points: Sequence[int], progress: Progress, title: str
+) -> Iterator[tuple[Pass, float]]:
+    """The passes after which is measured, and the seconds of the processor that training took until then.
+
+    What is done between them does not count. The progress bar is moved, to its end when training ends.
+    """
+    seconds, begin, reported = 0.0, time.process_time(), 0
+    try:
+        for done in passes:
+            if done.number in points:
+                seconds += time.process_time() - begin
+                progress(f"{title}, pass {done.number} of {points[-1]}", done.number - reported)
+                reported = done.number
+                yield done, seconds
+                begin = time.process_time()
+    finally:
+        progress(title, points[-1] - reported)
 
 
 def warm_up(model: Any, module: EnergyPretraining, v: Tensor) -> None:

@@ -1,7 +1,6 @@
 """A training of an energy model on a table, measured on the way by held-out rows, and at its end by test rows."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
@@ -17,7 +16,7 @@ from memcomp_lightning.likelihood.both_ways import estimate_both_ways
 from memcomp_lightning.models import EnergyModel, stacked
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.density.settings import Density
-from memcomp_lightning.studies.likelihood import warm_up
+from memcomp_lightning.studies.likelihood import measured_passes, warm_up
 from memcomp_lightning.studies.measures.gradient_bias import without_diverged
 from memcomp_lightning.studies.plan import Trial, passes_without_trainer, pretraining_of, require_bits
 from memcomp_lightning.studies.records import Record
@@ -93,14 +92,9 @@ class DensityTrial(Trial):
         measured = dict[str, list[list[float]]](valid=[], train=[], log_z_gap=[])
         record = Record.of(self, at=[], seconds=[], measures=measured)
         updates, best = sum(batch.closes_step for batch in batches), BestPass(patience=self.density.patience)
-        seconds, begin, reported = 0.0, time.process_time(), 0
+        passes = passes_without_trainer(module, batches, stage=own_stage, seed=self.seeds[0])
         try:
-            for done in passes_without_trainer(module, batches, stage=own_stage, seed=self.seeds[0]):
-                if done.number not in self.points:
-                    continue
-                seconds += time.process_time() - begin
-                progress(f"{self.title}, pass {done.number} of {self.points[-1]}", done.number - reported)
-                reported = done.number
+            for done, seconds in measured_passes(passes, self.points, progress, self.title):
                 model, diverged = without_diverged(trained)
                 betas, chains = self.density.quick_betas, self.density.chains
                 of_rows = scores_of(model, train, [held_out, train], betas, chains, enumerated=ENUMERATED)
@@ -114,12 +108,10 @@ class DensityTrial(Trial):
                     measured[name].append(value.tolist())
                 if best.over:
                     break
-                begin = time.process_time()
         except (DivergedError, SettingError):  # the second is a solver's that is given NaN
             pass
-        progress(self.title, self.points[-1] - reported)
         if best.value is None:
-            return [self._diverged(record, time.process_time() - begin)]
+            return [self._diverged(record)]
         record = replace(record, held_out=float(best.value.median()))
         if self.choosing:
             return [record]
@@ -131,14 +123,14 @@ class DensityTrial(Trial):
         found |= {"valid_best": scores[1].least, "independent": base.expand_as(scores[0].up)}
         return [replace(record, measures={**measured, **{name: [x.tolist()] for name, x in found.items()}})]
 
-    def _diverged(self, record: Record, seconds: float) -> Record:
+    def _diverged(self, record: Record) -> Record:
         """What is left of a training that diverged before it was measured: it loses."""
         unknown = [[math.nan] * len(self.seeds)]
         measures = dict.fromkeys(("valid", "train", "log_z_gap"), unknown)
         if not self.choosing:
             names = ("test", "test_reverse", "standard_error", "valid_best", "independent")
             measures |= dict.fromkeys(names, unknown)
-        return replace(record, held_out=-math.inf, at=[0], seconds=[seconds], measures=measures)
+        return replace(record, held_out=-math.inf, at=[0], seconds=[0.0], measures=measures)
 
 
 @torch.no_grad()
