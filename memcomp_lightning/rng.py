@@ -56,9 +56,11 @@ def _digest(seed: int, name: str, index: int) -> bytes:
     return hashlib.sha256(f"{seed}/{name}/{index}".encode()).digest()[:8]
 
 
-def streams(seed: int, names: Iterable[str], index: int = 0) -> "dict[str, torch.Generator]":
+def streams(
+    seed: int, names: Iterable[str], index: int = 0, device: "torch.device | str" = "cpu"
+) -> "dict[str, torch.Generator]":
     """Return one generator a name, see :func:`stream`."""
-    return {name: stream(seed, name, index) for name in names}
+    return {name: stream(seed, name, index, device) for name in names}
 
 
 def save(generators: "dict[str, torch.Generator]") -> "dict[str, Tensor]":

@@ -23,7 +23,7 @@ from memcomp_lightning.callbacks.base import (
 )
 from memcomp_lightning.callbacks.sampler_diagnostics import chains_persist
 from memcomp_lightning.errors import require_choice, require_count
-from memcomp_lightning.likelihood.chains import MOST_BEHIND, log_z_from_chains
+from memcomp_lightning.likelihood.chains import MOST_BEHIND, log_z_from_chains, stopped_mixing
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import RBM, EnergyModel
 from memcomp_lightning.models.machine import log2_states
@@ -267,9 +267,9 @@ class LogLikelihood(EveryIterations):
 def behind(gap: float) -> str:
     """What a gap above :data:`MOST_BEHIND` means, and what to do."""
     return (
-        f"the chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing, and the "
-        "likelihood falls where that goes on. Let the learning rate fall (pretrain=falling), take more chains "
-        "(sampler.n_chains=500), or chains at several temperatures (sampler=tempering)."
+        f"{stopped_mixing(gap)}, and the likelihood falls where that goes on. Let the learning rate fall "
+        "(pretrain=falling), take more chains (sampler.n_chains=500), or chains at several temperatures "
+        "(sampler=tempering)."
     )
 
 

@@ -8,12 +8,10 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from memcomp_lightning.configuration.plans import plan_of
+from memcomp_lightning.configuration.rows import HELD_OUT
 from memcomp_lightning.errors import UserError, require, require_choice
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.studies import AccuracyTrial, Records, SideBySide
-
-HELD_OUT = 0.1
-"""Share of the training images that judge, unless ``data.validation_fraction`` sets one."""
 
 log = logging.getLogger(__name__)
 

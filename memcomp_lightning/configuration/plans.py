@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -44,9 +44,7 @@ from memcomp_lightning.training import EnergyStep, UpDownStep, balanced
 from memcomp_lightning.training.score import FILL_IN, NO_GAPS
 
 if TYPE_CHECKING:
-    from memcomp_lightning.data import SequenceData, TableData
-
-    Data: TypeAlias = ImageData | TableData | SequenceData
+    from memcomp_lightning.configuration.rows import Data
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Data: TypeAlias = ImageData | TableData | SequenceData
 
 HELD_OUT = 0.1
-"""Share of a table's training rows that is held out where none is typed."""
+"""Share of the training rows that is held out where none is typed and something is to be chosen."""
 
 FEWEST_TO_HOLD_OUT = 200
 """Training rows below which none are held out so."""

@@ -52,7 +52,7 @@ from memcomp_lightning.likelihood import (
     log_partition_function,
     log_pseudo_likelihood,
 )
-from memcomp_lightning.likelihood.chains import MOST_BEHIND, gap_of_chains
+from memcomp_lightning.likelihood.chains import MOST_BEHIND, gap_of_chains, stopped_mixing
 from memcomp_lightning.models.chains import sweep
 from memcomp_lightning.samplers import ParallelTempering
 from memcomp_lightning.training import Greedy, LearningRateDecay, PhaseTraining, require_finite
@@ -138,7 +138,8 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         with on_the_cpu():
             self._begin(samples, seed, n_passes=self._n_passes(samples))
             self._run_passes(self.rbm_, samples, held_out)
-            self._warn_if_chains_are_behind()
+            if not self.early_stopping:  # which ends with weights that the last chains do not belong to
+                self._warn_if_chains_are_behind()
         return self
 
     def partial_fit(self, X: ArrayLike, y: object = None, sample_weight: ArrayLike | None = None) -> Self:
@@ -199,9 +200,9 @@ class MemcompRBM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, MemcompEstim
         gap = float(gap_of_chains(rbm, chains, base=self._base))
         if gap > MOST_BEHIND:
             warnings.warn(
-                f"The chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing, and "
-                "the model may be worse than earlier. Lower learning_rate or last_rate, or take more chains or "
-                "several temperatures: sampler=memcomp_lightning.samplers.ParallelTempering().",
+                f"At the end of fit {stopped_mixing(gap)}, and the model may be worse than earlier. Lower "
+                "learning_rate or last_rate, or take more chains or several temperatures: "
+                "sampler=memcomp_lightning.samplers.ParallelTempering().",
                 ConvergenceWarning,
                 stacklevel=3,
             )

@@ -12,6 +12,11 @@ MOST_BEHIND = 1.0
 """Nats by which log Z from chains may stay below log Z by annealing."""
 
 
+def stopped_mixing(gap: float) -> str:
+    """What a gap above :data:`MOST_BEHIND` means."""
+    return f"the chains have stopped mixing: log Z from them is {gap:.1f} nats below log Z by annealing"
+
+
 @torch.no_grad()
 def gap_of_chains(
     rbm: RBM,

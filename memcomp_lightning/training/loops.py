@@ -88,7 +88,7 @@ def pretrain(
     require_count("iterations", iterations, minimum=0)
     # On the parameters' device: a draw from elsewhere would be copied in each update, and the copy would wait.
     device = next(stage.network.parameters()).device
-    streams = {name: rng.stream(seed, name, device=device) for name in ("negative_phase", "positive_phase")}
+    streams = rng.streams(seed, ("negative_phase", "positive_phase"), device=device)
     for number, phase in enumerate(stage.phases):
         model = cast(nn.Module, phase.model).to(device)  # it need not be a part of the network
         training = PhaseTraining(

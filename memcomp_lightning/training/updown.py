@@ -148,7 +148,7 @@ def up_down(
     require_count("iterations", iterations)
     step = UpDownStep() if step is None else step
     device = model.top.b.device
-    streams = {name: rng.stream(seed, name, device=device) for name in STREAMS}
+    streams = rng.streams(seed, STREAMS, device=device)
     made, state = optimizer(model.parameters()), StepState()
     for epoch in range(iterations):
         begin_epoch(batches, epoch)

@@ -149,8 +149,8 @@ def scores_of(
         error = torch.zeros_like(up)
     else:
         # Files may be sorted.
-        some = torch.randperm(len(train), generator=rng.stream(0, "rows"), device="cpu")[:chains]
-        found = estimate_both_ways(model, train[some], n_chains=chains, n_betas=betas, n_sweeps=SWEEPS, seed=0)
+        order = torch.randperm(len(train), generator=rng.stream(0, "rows"), device="cpu")
+        found = estimate_both_ways(model, train[order], n_chains=chains, n_betas=betas, n_sweeps=SWEEPS, seed=0)
         up, down, error = found.up.log_z, found.down.log_z, found.standard_error
     of_rows = [log_likelihood_or_bound(model, v, torch.zeros_like(up)).double().mean(-1) for v in rows]
     return [Scores(mean - up, mean - down, error) for mean in of_rows]

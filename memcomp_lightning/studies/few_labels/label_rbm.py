@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
+from memcomp_lightning.defaults import FINETUNING_MOMENTUM
 from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.units import Bernoulli, Categorical, Mixed
@@ -20,8 +21,6 @@ from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.training import ClassifierStep, EnergyStep, StepState
 from memcomp_lightning.training.given import begin_epoch
 from memcomp_lightning.types import Batch, Configurations
-
-MOMENTUM = 0.9
 
 AT_ONCE = 500
 """Rows that are judged together: each takes a number a class and hidden unit."""
@@ -92,7 +91,7 @@ class LabelRbm:
     def _passes(
         self, network: FreeEnergyClassifier, sets: Sets, rate: float, generative: float, size: int, n_passes: int
     ) -> Iterator[int]:
-        optimizer = torch.optim.SGD(network.rbm.parameters(), lr=rate, momentum=MOMENTUM)
+        optimizer = torch.optim.SGD(network.rbm.parameters(), lr=rate, momentum=FINETUNING_MOMENTUM)
         energy, by_class = EnergyStep(sampler=CD(), centring=Centring(rate=0.01)), ClassifierStep(network)
         batches, state, generator = sets.batches(size), StepState(), rng.stream(sets.seed, "label RBM")
         for number in range(n_passes):

@@ -11,13 +11,12 @@ import torch
 from torch import nn
 
 from memcomp_lightning import rng
+from memcomp_lightning.defaults import FINETUNING_MOMENTUM
 from memcomp_lightning.models import BatchNormReluNetwork, Linear, Normal, Randomiser, Xavier, stacked
 from memcomp_lightning.studies.few_labels.data import Sets, batches
 from memcomp_lightning.studies.few_labels.learner import Given, Point, point_of
 from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.training import DivergedError, finetune
-
-MOMENTUM = 0.9
 
 
 class Start(Protocol):
@@ -103,7 +102,10 @@ def trained(
     ``others`` are places and classes of rows to learn from in the place of the labelled ones.
     """
     optimizer = partial(
-        torch.optim.SGD, lr=setting["rate"], momentum=MOMENTUM, weight_decay=setting.get("weight_decay", 0.0)
+        torch.optim.SGD,
+        lr=setting["rate"],
+        momentum=FINETUNING_MOMENTUM,
+        weight_decay=setting.get("weight_decay", 0.0),
     )
     at, label = (sets.at, sets.label) if others is None else others
     passes = finetune(
