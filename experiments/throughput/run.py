@@ -27,7 +27,8 @@ from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule, 
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.samplers import CD
-from memcomp_lightning.training import Greedy
+from memcomp_lightning.training import Greedy, pretrain
+from memcomp_lightning.training.given import Given
 
 N_VISIBLE, N_HIDDEN, BATCH, LEARNING_RATE, MOMENTUM = 784, 500, 100, 0.1, 0.5
 
@@ -56,12 +57,23 @@ class Clock(pl.Callback):
         self.spent = Seconds.now().since(self.begin)
 
 
-def lightning_epoch(images: ImageData) -> tuple[Seconds, Tensor]:
+class OneStep(EnergyPretraining):
+    """Works in its first step alone and repeats what that returned: what is left is Lightning's loop."""
+
+    def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
+        if batch_idx == 0:
+            self._returned = super().training_step(batch, batch_idx)
+        return self._returned
+
+
+def lightning_epoch(
+    images: ImageData, kind: type[EnergyPretraining] = EnergyPretraining
+) -> tuple[Seconds, Tensor]:
     """One epoch through EnergyPretraining, with callbacks and TensorBoard; seconds of training, final weights."""
     clock = Clock()
     dbn = DBN(N_VISIBLE, [N_HIDDEN])
     optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
-    module = EnergyPretraining(Greedy(dbn), CD(k=1), iterations=1, optimizer=optimizer, centring=None)
+    module = kind(Greedy(dbn), CD(k=1), iterations=1, optimizer=optimizer, centring=None)
     with tempfile.TemporaryDirectory() as folder:
         trainer = pl.Trainer(
             max_epochs=1,
@@ -76,6 +88,17 @@ def lightning_epoch(images: ImageData) -> tuple[Seconds, Tensor]:
         )
         trainer.fit(module, datamodule=ImageDataModule(images, batch_size=BATCH))
     return clock.spent, dbn[0].weight.detach()
+
+
+def bare_epoch(images: ImageData) -> Seconds:
+    """The same updates by the package's loop without a trainer."""
+    dbn = DBN(N_VISIBLE, [N_HIDDEN])
+    batches = Batches(images.train_v, images.train_label, BATCH, len(images.train_v), True, 0)
+    optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
+    begin = Seconds.now()
+    for _ in pretrain(Greedy(dbn), batches, CD(k=1), iterations=1, optimizer=optimizer):
+        pass
+    return Seconds.now().since(begin)
 
 
 @torch.no_grad()
@@ -160,6 +183,8 @@ def main() -> None:
     images = random_images(arguments.images)
     candidates: dict[str, Callable[[], Seconds]] = {
         "EnergyPretraining, logging on": lambda: lightning_epoch(images)[0],
+        "Lightning without work in its steps": lambda: lightning_epoch(images, OneStep)[0],
+        "training.pretrain, without a trainer": lambda: bare_epoch(images),
         "hand-written torch loop": lambda: hand_written_epoch(images)[0],
         "scikit-learn BernoulliRBM, float32": lambda: sklearn_epoch(images, "float32"),
         "scikit-learn BernoulliRBM, float64": lambda: sklearn_epoch(images, "float64"),
