@@ -17,7 +17,7 @@ from memcomp_lightning.files import write_json
 from memcomp_lightning.studies import Plan, Record, Records, runner
 from memcomp_lightning.studies.few_labels import FewLabels, LabelsTrial, PretrainingTrial
 from memcomp_lightning.studies.few_labels.learner import weight_file
-from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of, network_of
+from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of, dbn_of
 from memcomp_lightning.studies.plan import images_of, pretraining_of, require_bits
 
 _SET_BY_STUDY = {
@@ -42,7 +42,7 @@ def check(config: DictConfig, overrides: Sequence[str]) -> None:
         own = OmegaConf.create(trial.settings)
         plan = build(own)
         check_without_trainer(plan, own)
-        network_of(plan)
+        dbn_of(plan)
         if trial.way is not None:
             require_parts(
                 f"few_labels.pretraining.{trial.method}.way", trial.way, "way of pretraining", ("train",)

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from memcomp_lightning.data.labels import labelled_at
 from memcomp_lightning.studies.few_labels.data import Sets
-from memcomp_lightning.studies.few_labels.learner import Given, Point
+from memcomp_lightning.studies.few_labels.learner import Context, Point
 from memcomp_lightning.studies.search import Setting
 
 
 class Features(Protocol):
     """What a classifier sees of a row."""
 
-    def of(self, v: Tensor, given: Given, setting: Setting) -> Tensor:
+    def of(self, v: Tensor, context: Context, setting: Setting) -> Tensor:
         """Features of rows ``(n, n_visible)``, ``(n, n_features)``."""
 
 
@@ -27,7 +27,7 @@ class Features(Protocol):
 class Pixels:
     """The rows themselves."""
 
-    def of(self, v: Tensor, given: Given, setting: Setting) -> Tensor:
+    def of(self, v: Tensor, context: Context, setting: Setting) -> Tensor:
         """See :class:`Features`."""
         return v
 
@@ -36,9 +36,9 @@ class Pixels:
 class PrincipalComponents:
     """The first components of all training rows, each of variance one; a setting says how many."""
 
-    def of(self, v: Tensor, given: Given, setting: Setting) -> Tensor:
+    def of(self, v: Tensor, context: Context, setting: Setting) -> Tensor:
         """See :class:`Features`."""
-        mean, axes, variance = given.principal
+        mean, axes, variance = context.principal
         n = setting["components"]
         return ((v - mean) @ axes[:, :n]) / variance[:n].sqrt()
 
@@ -50,9 +50,9 @@ class HiddenMeans:
     pretrained: str
 
     @torch.no_grad()
-    def of(self, v: Tensor, given: Given, setting: Setting) -> Tensor:
+    def of(self, v: Tensor, context: Context, setting: Setting) -> Tensor:
         """See :class:`Features`."""
-        found: Tensor = given.pretrained(self.pretrained)(v)
+        found: Tensor = context.pretrained(self.pretrained)(v)
         return found
 
 
@@ -68,16 +68,16 @@ class Classical(ABC):
     features: Features
     most: int | None
 
-    def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
+    def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""
         accuracy = []
         for at, label, judged_at, judged_label in zip(
             sets.at, sets.label, sets.judging_at, sets.judging_label, strict=True
         ):
             own = _spread(label, self.most)
-            x = self.features.of(sets.rows[at[own]], given, setting).numpy()
+            x = self.features.of(sets.rows[at[own]], context, setting).numpy()
             y = label[own].numpy()
-            judged = self.features.of(sets.judging[judged_at], given, setting).numpy()
+            judged = self.features.of(sets.judging[judged_at], context, setting).numpy()
             if len(np.unique(y)) == 1:
                 right = judged_label.numpy() == y[0]
             else:

@@ -16,7 +16,7 @@ from memcomp_lightning.models.units import Bernoulli, Categorical, Mixed
 from memcomp_lightning.objective import Centring
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.studies.few_labels.data import Sets
-from memcomp_lightning.studies.few_labels.learner import Given, Point, point_of
+from memcomp_lightning.studies.few_labels.learner import Context, Point, point_of
 from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.training import ClassifierStep, EnergyStep, StepState
 from memcomp_lightning.training.given import begin_epoch
@@ -71,17 +71,17 @@ class LabelRbm:
     generative: float
     unlabelled: float = 1.0
 
-    def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
+    def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""
-        dbn = given.pretrained(self.pretrained)
+        dbn = context.pretrained(self.pretrained)
         with torch.no_grad():
-            rows = given.kept(f"{self.pretrained}, {self.layer}", lambda: dbn.visible_of(self.layer, sets.rows))
+            rows = context.kept(f"{self.pretrained}, {self.layer}", lambda: dbn.visible_of(self.layer, sets.rows))
             judging = rows if sets.judging is sets.rows else dbn.visible_of(self.layer, sets.judging)
         sets = replace(sets, rows=rows, judging=judging)
         n = sets.at.shape[-1]
-        points = given.lengths.points(n) if passes is None else tuple(passes)
-        network = FreeEnergyClassifier(with_class(dbn[self.layer], sets, given.seed), sets.n_classes)
-        weight, size = setting.get("generative", self.generative), given.lengths.batch_size(n)
+        points = context.lengths.points(n) if passes is None else tuple(passes)
+        network = FreeEnergyClassifier(with_class(dbn[self.layer], sets, context.seed), sets.n_classes)
+        weight, size = setting.get("generative", self.generative), context.lengths.batch_size(n)
         found = []
         for done in self._passes(network, sets, setting["rate"], weight, size, points[-1]):
             if done in points:

@@ -68,7 +68,7 @@ class Lengths:
 
 
 @dataclass(kw_only=True)
-class Given:
+class Context:
     """What a method is given beside the rows.
 
     Attributes:
@@ -119,11 +119,11 @@ def weight_file(folder: Path, name: str, seed: int) -> Path:
 class Learner(Protocol):
     """A method; its settings are frozen, and what is tuned comes as a setting."""
 
-    def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
+    def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """Learn from each of the sets alone, and measure by its judging rows.
 
         Args:
-            given: Weights, lengths and seeds.
+            context: Weights, lengths and seeds.
             sets: Rows.
             setting: What is tuned.
             passes: After which is measured; None is as the method thinks best.

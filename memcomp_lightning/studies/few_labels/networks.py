@@ -14,7 +14,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.defaults import FINETUNING_MOMENTUM
 from memcomp_lightning.models import BatchNormReluNetwork, Linear, Normal, Randomiser, Xavier, stacked
 from memcomp_lightning.studies.few_labels.data import Sets, batches
-from memcomp_lightning.studies.few_labels.learner import Given, Point, point_of
+from memcomp_lightning.studies.few_labels.learner import Context, Point, point_of
 from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.training import DivergedError, finetune
 
@@ -22,7 +22,7 @@ from memcomp_lightning.training import DivergedError, finetune
 class Start(Protocol):
     """What a network is before it sees a label."""
 
-    def network(self, given: Given, n_classes: int) -> nn.Module:
+    def network(self, context: Context, n_classes: int) -> nn.Module:
         """A new one."""
 
 
@@ -38,12 +38,12 @@ class Pretrained:
     of: str | None
     change: Randomiser | None = None
 
-    def network(self, given: Given, n_classes: int) -> nn.Module:
+    def network(self, context: Context, n_classes: int) -> nn.Module:
         """DBN and output layer, whose weights are N(0, 0.01^2)."""
-        dbn = copy.deepcopy(given.blank) if self.of is None else given.pretrained(self.of)
+        dbn = copy.deepcopy(context.blank) if self.of is None else context.pretrained(self.of)
         if self.change is not None:
-            self.change(dbn, generator=rng.stream(given.seed, "between stages"))
-        own = rng.stream(given.seed, "output weights")
+            self.change(dbn, generator=rng.stream(context.seed, "between stages"))
+        own = rng.stream(context.seed, "output weights")
         output = Linear(dbn.n_hidden, n_classes, weight_init=Normal(std=0.01), generator=own)
         return nn.Sequential(dbn, output)
 
@@ -52,11 +52,11 @@ class Pretrained:
 class BatchNormRelu:
     """Batch normalisation and ReLU in layers of the same size, Xavier weights."""
 
-    def network(self, given: Given, n_classes: int) -> nn.Module:
+    def network(self, context: Context, n_classes: int) -> nn.Module:
         """A new one."""
-        sizes, own = [rbm.n_hidden for rbm in given.blank], rng.stream(given.seed, "weights")
+        sizes, own = [rbm.n_hidden for rbm in context.blank], rng.stream(context.seed, "weights")
         return BatchNormReluNetwork(
-            given.blank.n_visible, sizes, n_classes, weight_init=Xavier(gain=1.0), generator=own
+            context.blank.n_visible, sizes, n_classes, weight_init=Xavier(gain=1.0), generator=own
         )
 
 
@@ -69,22 +69,22 @@ class Network:
 
     start: Start
 
-    def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
+    def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""
         found = []
         with contextlib.suppress(DivergedError):  # what it had reached before counts
-            for done, network in self.fit(given, sets, setting, passes):
+            for done, network in self.fit(context, sets, setting, passes):
                 found.append(point_of(done, network, sets))
         return found
 
     def fit(
-        self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None
+        self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None
     ) -> Iterator[tuple[int, nn.Module]]:
         """Train; yield the networks side by side after each of the passes."""
         n = sets.at.shape[-1]
-        network = stacked([self.start.network(given, sets.n_classes)] * sets.n_sets, ())
-        points = given.lengths.points(n) if passes is None else tuple(passes)
-        size = given.lengths.batch_size(n)
+        network = stacked([self.start.network(context, sets.n_classes)] * sets.n_sets, ())
+        points = context.lengths.points(n) if passes is None else tuple(passes)
+        size = context.lengths.batch_size(n)
         yield from trained(network, sets, setting, points, size)
 
 

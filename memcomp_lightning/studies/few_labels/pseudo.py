@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from memcomp_lightning import rng
 from memcomp_lightning.studies.few_labels.data import Sets
-from memcomp_lightning.studies.few_labels.learner import Given, Point, point_of
+from memcomp_lightning.studies.few_labels.learner import Context, Point, point_of
 from memcomp_lightning.studies.few_labels.networks import Network, trained
 from memcomp_lightning.studies.search import Setting
 from memcomp_lightning.training import DivergedError
@@ -32,20 +32,20 @@ class PseudoLabels:
     unlabelled: int
     passes: Sequence[int]
 
-    def learn(self, given: Given, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
+    def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""
-        assert given.base is not None
-        of_base = dict(given.base)
+        assert context.base is not None
+        of_base = dict(context.base)
         found: list[Point] = []
         with contextlib.suppress(DivergedError):
-            *_, (_, network) = self.base.fit(given, sets, of_base, (int(of_base["passes"]),))
+            *_, (_, network) = self.base.fit(context, sets, of_base, (int(of_base["passes"]),))
             others = _without_label(sets, self.unlabelled)
             n_taken = round(setting["share"] * len(others))
             if not n_taken:
                 return [point_of(0, network, sets)]
             points = tuple(self.passes) if passes is None else tuple(passes)
             taken = _with_pseudo_labels(network, sets, others, n_taken)
-            size = given.lengths.batch_size(taken[0].shape[-1])
+            size = context.lengths.batch_size(taken[0].shape[-1])
             for done, now in trained(network, sets, of_base, points, size, others=taken):
                 found.append(point_of(done, now, sets))
         return found

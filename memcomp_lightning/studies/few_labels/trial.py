@@ -14,7 +14,7 @@ from memcomp_lightning.models import DBN
 from memcomp_lightning.modules.weights import save_weights
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.few_labels.data import drawn, folded, whole
-from memcomp_lightning.studies.few_labels.learner import Given, Learner, weight_file
+from memcomp_lightning.studies.few_labels.learner import Context, Learner, weight_file
 from memcomp_lightning.studies.few_labels.settings import FewLabels
 from memcomp_lightning.studies.few_labels.tuning import cross_validated
 from memcomp_lightning.studies.plan import Plan, Trial, images_of, passes_without_trainer, pretraining_of
@@ -54,7 +54,7 @@ class PretrainingTrial(Trial):
         """Train, and leave the weights and a record of the time."""
         assert self.seed is not None
         plan = self.build({**self.settings, "seed": self.seed})
-        dbn, (stage, module) = network_of(plan), pretraining_of(plan)
+        dbn, (stage, module) = dbn_of(plan), pretraining_of(plan)
         begin, done = time.process_time(), 0
 
         def say(passes: int) -> None:
@@ -110,8 +110,8 @@ class LabelsTrial(Trial):
         data = images_of(pretraining_of(plan)[0])
         (rows, label), test = data.train, _with_label(data.test)
         own, begin = drawn(label, self.labels, draw), time.process_time()
-        given = Given(
-            blank=network_of(plan),
+        context = Context(
+            blank=dbn_of(plan),
             folder=Path(self.folder),
             pretrained_by=draw % self.study.pretrainings,
             seed=draw,
@@ -121,9 +121,9 @@ class LabelsTrial(Trial):
         )
         folds = folded(rows, own, self.study.n_folds(len(own.at)), data.n_classes, draw)
         search = self.study.searches[self.study.methods[self.method].search]
-        chosen = cross_validated(self.learner, given, folds, search.axes, search.start)
+        chosen = cross_validated(self.learner, context, folds, search.axes, search.start)
         everything = whole(rows, own, test, data.n_classes, draw)
-        points = self.learner.learn(given, everything, chosen.setting, (chosen.passes,))
+        points = self.learner.learn(context, everything, chosen.setting, (chosen.passes,))
         accuracy = float(points[-1].accuracy[0]) if points else 0.0
         measures = {"test_accuracy": [[accuracy]], "cross_validated": [[chosen.accuracy]]}
         measures |= {"labels": [[float(len(own.at))]]}
@@ -144,7 +144,7 @@ def chosen_of(record: Record) -> dict[str, float]:
     }
 
 
-def network_of(plan: Plan) -> DBN:
+def dbn_of(plan: Plan) -> DBN:
     """The DBN of a plan.
 
     Raises:

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from memcomp_lightning.studies.few_labels.data import Sets
-from memcomp_lightning.studies.few_labels.learner import Given, Learner, Point
+from memcomp_lightning.studies.few_labels.learner import Context, Learner, Point
 from memcomp_lightning.studies.search import Axes, Setting, best_of, missing, text_of
 
 
@@ -24,12 +24,12 @@ class Chosen(NamedTuple):
     tried: int
 
 
-def cross_validated(learner: Learner, given: Given, folds: Sets, axes: Axes, start: Setting) -> Chosen:
+def cross_validated(learner: Learner, context: Context, folds: Sets, axes: Axes, start: Setting) -> Chosen:
     """Walk uphill on each axis, see :mod:`memcomp_lightning.studies.search`; each setting has its best passes."""
     judged, best = dict[str, float](), dict[str, Point]()
     while asked := missing(axes, start, judged):
         for setting in asked:
-            points = learner.learn(given, folds, setting, None)
+            points = learner.learn(context, folds, setting, None)
             key, found = text_of(setting), max(points, key=lambda point: point.value, default=None)
             judged[key] = -math.inf if found is None else found.value
             if found is not None:

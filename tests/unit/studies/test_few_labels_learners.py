@@ -36,7 +36,7 @@ from memcomp_lightning.studies.few_labels import (
 )
 from memcomp_lightning.studies.few_labels.data import Sets, drawn, folded, whole
 from memcomp_lightning.studies.few_labels.label_rbm import FreeEnergyClassifier, with_class
-from memcomp_lightning.studies.few_labels.learner import Given, Lengths, Point, weight_file
+from memcomp_lightning.studies.few_labels.learner import Context, Lengths, Point, weight_file
 from memcomp_lightning.studies.few_labels.plot import few_labels_figures
 from memcomp_lightning.studies.few_labels.pseudo import _with_pseudo_labels, _without_label
 from memcomp_lightning.studies.few_labels.results import few_labels_table, few_labels_verdicts, worth_note
@@ -132,7 +132,7 @@ class Spy:
     shown: list[tuple[Sets, Sequence[int] | None]] = field(default_factory=list)
 
     def learn(
-        self, given: Given, sets: Sets, setting: dict[str, float], passes: Sequence[int] | None
+        self, context: Context, sets: Sets, setting: dict[str, float], passes: Sequence[int] | None
     ) -> list[Point]:
         self.shown.append((sets, passes))
         value = torch.full((sets.n_sets,), setting["rate"])
@@ -227,10 +227,10 @@ def test_nothing_but_its_own_labels_moves_what_a_method_chooses(name: str, tmp_p
     assert first.key == second.key
 
 
-def given(tmp_path: Path, data: ImageData) -> Given:
+def context(tmp_path: Path, data: ImageData) -> Context:
     lengths = Lengths(updates=200, passes=5, measured=3, batch_sizes=[5, 20])
     blank = DBN(N_VISIBLE, [5, 4])
-    return Given(blank=blank, folder=tmp_path, pretrained_by=0, seed=0, lengths=lengths, rows=data.train_v)
+    return Context(blank=blank, folder=tmp_path, pretrained_by=0, seed=0, lengths=lengths, rows=data.train_v)
 
 
 def test_classes_follow_from_free_energies() -> None:
@@ -256,14 +256,14 @@ def test_what_can_be_learned_is_learned(name: str, tmp_path: Path) -> None:
     held = torch.arange(N_TRAIN)[~torch.isin(torch.arange(N_TRAIN), own.at)]
     sets = whole(data.train_v, own, (data.train_v[held], data.train_label[held]), N_CLASSES, 0)
     setting = {"rate": 0.02 if name == "batch norm" else 0.2, "C": 10.0}
-    points = LEARNERS[name].learn(given(tmp_path, data), sets, setting, None)
+    points = LEARNERS[name].learn(context(tmp_path, data), sets, setting, None)
     assert float(points[-1].accuracy[0]) > 0.8
     assert [point.passes for point in points] == ([0] if name == "regression" else [4, 8, 17])
 
 
 def test_components_have_variance_one_and_are_those_of_all_rows(tmp_path: Path) -> None:
     data = images()
-    features = PrincipalComponents().of(data.train_v, given(tmp_path, data), {"components": 4})
+    features = PrincipalComponents().of(data.train_v, context(tmp_path, data), {"components": 4})
     torch.testing.assert_close(features.T @ features / N_TRAIN, torch.eye(4), atol=1e-4, rtol=0)
     centred = data.train_v - data.train_v.mean(0)
     left = torch.linalg.svd(centred, full_matrices=False).U[:, :4] * N_TRAIN**0.5
@@ -289,7 +289,7 @@ def test_pseudo_labels_are_of_rows_without_one(tmp_path: Path) -> None:
     data = images()
     sets = folded(data.train_v, drawn(data.train_label, 15, 0), 3, N_CLASSES, 0)
     network = Network(start=BatchNormRelu())
-    *_, (_, trained) = network.fit(given(tmp_path, data), sets, {"rate": 0.1}, (10,))
+    *_, (_, trained) = network.fit(context(tmp_path, data), sets, {"rate": 0.1}, (10,))
     others = _without_label(sets, 50)
     assert len(others) == 50
     assert not torch.isin(others, sets.at).any()
