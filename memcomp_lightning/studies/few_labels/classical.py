@@ -45,14 +45,12 @@ class PrincipalComponents:
 
 @dataclass(frozen=True, kw_only=True)
 class HiddenMeans:
-    """Means of the top hidden units of a pretrained DBN."""
-
-    pretrained: str
+    """Means of the top hidden units of the pretrained DBN."""
 
     @torch.no_grad()
     def of(self, v: Tensor, context: Context, setting: Setting) -> Tensor:
         """See :class:`Features`."""
-        found: Tensor = context.pretrained(self.pretrained)(v)
+        found: Tensor = context.dbn()(v)
         return found
 
 

@@ -58,14 +58,12 @@ class LabelRbm:
     as many rows without label, whose class is drawn from :math:`p(y | v)`, so that it is summed over.
 
     Attributes:
-        pretrained: Name of the pretraining.
         layer: Of its RBM: 0 sees the data, 1 the means of the first hidden layer.
         discriminative: Whether log p(y | v) is part of what is maximised.
         generative: Weight of log p(v, y), >= 0, unless a setting says it.
         unlabelled: Weight of a row without label, as against one with, in the generative part.
     """
 
-    pretrained: str
     layer: int
     discriminative: bool
     generative: float
@@ -73,9 +71,9 @@ class LabelRbm:
 
     def learn(self, context: Context, sets: Sets, setting: Setting, passes: Sequence[int] | None) -> list[Point]:
         """See :class:`Learner`."""
-        dbn = context.pretrained(self.pretrained)
+        dbn = context.dbn()
         with torch.no_grad():
-            rows = context.kept(f"{self.pretrained}, {self.layer}", lambda: dbn.visible_of(self.layer, sets.rows))
+            rows = context.kept(f"layer {self.layer}", lambda: dbn.visible_of(self.layer, sets.rows))
             judging = rows if sets.judging is sets.rows else dbn.visible_of(self.layer, sets.judging)
         sets = replace(sets, rows=rows, judging=judging)
         n = sets.at.shape[-1]

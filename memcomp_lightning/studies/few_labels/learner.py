@@ -73,6 +73,7 @@ class Context:
 
     Attributes:
         blank: A DBN of the size of all, with weights N(0, 0.01^2).
+        pretraining: Name of the method's pretraining; None is none.
         folder: Of the pretrained weights.
         pretrained_by: Seed of the pretraining.
         seed: Of everything else.
@@ -82,6 +83,7 @@ class Context:
     """
 
     blank: DBN
+    pretraining: str | None
     folder: Path
     pretrained_by: int
     seed: int
@@ -90,10 +92,11 @@ class Context:
     base: Mapping[str, float] | None = None
     _kept: dict[str, Tensor] = field(default_factory=dict)
 
-    def pretrained(self, name: str) -> DBN:
-        """A new DBN with the weights that a pretraining has left."""
+    def dbn(self) -> DBN:
+        """A new DBN with the weights that the pretraining has left, or small random ones without it."""
         dbn = copy.deepcopy(self.blank)
-        load_weights(dbn, weight_file(self.folder, name, self.pretrained_by))
+        if self.pretraining is not None:
+            load_weights(dbn, weight_file(self.folder, self.pretraining, self.pretrained_by))
         return dbn
 
     def kept(self, name: str, make: Callable[[], Tensor]) -> Tensor:

@@ -1,7 +1,6 @@
 """Networks that are trained by back-propagation: what they start from, and their training side by side."""
 
 import contextlib
-import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,19 +27,17 @@ class Start(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrained:
-    """A pretrained DBN with an output layer.
+    """The DBN of a method's pretraining, or one of small random weights, with an output layer.
 
     Attributes:
-        of: Name of the pretraining; None is none, small random weights.
         change: What is done to its weights, of the control group; None is nothing.
     """
 
-    of: str | None
     change: Randomiser | None = None
 
     def network(self, context: Context, n_classes: int) -> nn.Module:
         """DBN and output layer, whose weights are N(0, 0.01^2)."""
-        dbn = copy.deepcopy(context.blank) if self.of is None else context.pretrained(self.of)
+        dbn = context.dbn()
         if self.change is not None:
             self.change(dbn, generator=rng.stream(context.seed, "between stages"))
         own = rng.stream(context.seed, "output weights")

@@ -112,6 +112,7 @@ class LabelsTrial(Trial):
         own, begin = drawn(label, self.labels, draw), time.process_time()
         context = Context(
             blank=dbn_of(plan),
+            pretraining=self.study.methods[self.method].pretraining,
             folder=Path(self.folder),
             pretrained_by=draw % self.study.pretrainings,
             seed=draw,

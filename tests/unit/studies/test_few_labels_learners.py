@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ from memcomp_lightning.studies.few_labels.learner import Context, Lengths, Point
 from memcomp_lightning.studies.few_labels.plot import few_labels_figures
 from memcomp_lightning.studies.few_labels.pseudo import _with_pseudo_labels, _without_label
 from memcomp_lightning.studies.few_labels.results import few_labels_table, few_labels_verdicts, worth_note
-from memcomp_lightning.studies.few_labels.settings import Claim, Method, Search
+from memcomp_lightning.studies.few_labels.settings import Claim, Method, Pretraining, Search
 from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.studies.records import Record
@@ -101,7 +102,7 @@ def study(**settings: object) -> FewLabels:
         "measured": 2,
         "batch_sizes": [5, 10],
         "overrides": [],
-        "pretraining": {},
+        "pretraining": {"cd": Pretraining(overrides=[])},
         "searches": SEARCHES,
         "methods": {
             name: Method(label=name.upper(), panel="p", search="rates", learner={})
@@ -191,16 +192,17 @@ def test_all_methods_have_the_same_labels_and_choose_by_them_alone() -> None:
 
 
 LEARNERS = {
-    "network": Network(start=Pretrained(of=None)),
+    "network": Network(start=Pretrained()),
     "batch norm": Network(start=BatchNormRelu()),
-    "shuffled": Network(start=Pretrained(of="cd", change=Shuffled())),
+    "shuffled": Network(start=Pretrained(change=Shuffled())),
     "regression": Regression(features=Pixels(), most=None),
     "components": Regression(features=PrincipalComponents(), most=None),
-    "support vectors": SupportVectors(features=HiddenMeans(pretrained="cd"), most=9),
-    "class unit": LabelRbm(pretrained="cd", layer=0, discriminative=True, generative=0.1),
-    "top class unit": LabelRbm(pretrained="cd", layer=1, discriminative=False, generative=1.0),
+    "support vectors": SupportVectors(features=HiddenMeans(), most=9),
+    "class unit": LabelRbm(layer=0, discriminative=True, generative=0.1),
+    "top class unit": LabelRbm(layer=1, discriminative=False, generative=1.0),
     "pseudo-labels": PseudoLabels(base=Network(start=BatchNormRelu()), unlabelled=40, passes=(1, 2)),
 }
+PRETRAINED = {"shuffled", "support vectors", "class unit", "top class unit"}
 TUNED = {
     "regression": {"C": [0.1, 10.0]},
     "components": {"components": [2, 3], "C": [0.1, 10.0]},
@@ -217,7 +219,9 @@ def test_nothing_but_its_own_labels_moves_what_a_method_chooses(name: str, tmp_p
     found = []
     assert int((images().train_label != images(otherwise=True).train_label).sum()) > 40
     for data in (images(), images(otherwise=True)):
-        own = study(searches={"rates": search})
+        of = "cd" if name in PRETRAINED else None
+        spy = Method(label="SPY", panel="p", search="rates", learner={}, pretraining=of)
+        own = study(searches={"rates": search}, methods={**study().methods, "spy": spy})
         base = {"rate": 0.2, "passes": 2.0} if name == "pseudo-labels" else None
         one = trial(data, LEARNERS[name], folder=str(tmp_path), study=own, base=base)
         found.append(one.run(silent)[0])
@@ -227,10 +231,22 @@ def test_nothing_but_its_own_labels_moves_what_a_method_chooses(name: str, tmp_p
     assert first.key == second.key
 
 
-def context(tmp_path: Path, data: ImageData) -> Context:
+def context(tmp_path: Path, data: ImageData, pretraining: str | None = None) -> Context:
     lengths = Lengths(updates=200, passes=5, measured=3, batch_sizes=[5, 20])
     blank = DBN(N_VISIBLE, [5, 4])
-    return Context(blank=blank, folder=tmp_path, pretrained_by=0, seed=0, lengths=lengths, rows=data.train_v)
+    settings: dict[str, Any] = {"pretraining": pretraining, "folder": tmp_path, "pretrained_by": 0, "seed": 0}
+    return Context(blank=blank, **settings, lengths=lengths, rows=data.train_v)
+
+
+def test_a_dbn_has_the_weights_of_its_pretraining_each_time_anew(tmp_path: Path) -> None:
+    pretrained = DBN(N_VISIBLE, [5, 4], generator=rng.stream(7, "weights"))
+    save_weights(pretrained, weight_file(tmp_path, "cd", 0))
+    data = images()
+    for name, expected in (("cd", pretrained), (None, DBN(N_VISIBLE, [5, 4]))):
+        given = context(tmp_path, data, name)
+        first = Pretrained(change=Shuffled()).network(given, N_CLASSES)
+        assert not first[0][0].weight.equal(expected[0].weight)  # type: ignore[index]
+        assert given.dbn()[0].weight.equal(expected[0].weight)
 
 
 def test_classes_follow_from_free_energies() -> None:
@@ -256,7 +272,8 @@ def test_what_can_be_learned_is_learned(name: str, tmp_path: Path) -> None:
     held = torch.arange(N_TRAIN)[~torch.isin(torch.arange(N_TRAIN), own.at)]
     sets = whole(data.train_v, own, (data.train_v[held], data.train_label[held]), N_CLASSES, 0)
     setting = {"rate": 0.02 if name == "batch norm" else 0.2, "C": 10.0}
-    points = LEARNERS[name].learn(context(tmp_path, data), sets, setting, None)
+    of = "cd" if name in PRETRAINED else None
+    points = LEARNERS[name].learn(context(tmp_path, data, of), sets, setting, None)
     assert float(points[-1].accuracy[0]) > 0.8
     assert [point.passes for point in points] == ([0] if name == "regression" else [4, 8, 17])
 
