@@ -17,18 +17,18 @@ from collections.abc import Callable
 
 import lightning.pytorch as pl
 import torch
+from common import N_VISIBLE, random_images
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.profilers import SimpleProfiler
 
 from memcomp_lightning import callbacks as ours
-from memcomp_lightning import rng
-from memcomp_lightning.data import ImageData, ImageDataModule, PixelLayout
+from memcomp_lightning.data import ImageData, ImageDataModule
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import CD, PCD
 from memcomp_lightning.training import Greedy
 
-N_VISIBLE, BATCH, NEVER = 784, 100, 10**9
+BATCH, NEVER = 100, 10**9
 TARGET = 0.03
 Make = Callable[[], pl.Callback]
 
@@ -62,14 +62,6 @@ class PassTimes(pl.Callback):
 
     def on_train_epoch_end(self, *_: object) -> None:
         self.seconds.append(time.perf_counter() - self.begin)
-
-
-def random_images(n: int) -> ImageData:
-    """Random binary images; the content does not matter for time."""
-    v = rng.bernoulli(torch.full((n, N_VISIBLE), 0.5), generator=rng.stream(0, "images"))
-    label = torch.zeros(n, dtype=torch.int64)
-    held_out = v[: n // 10], label[: n // 10]
-    return ImageData(v, label, *held_out, n_classes=1, layout=PixelLayout(28, 28), name="random")
 
 
 def fit(
@@ -141,7 +133,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    images = random_images(arguments.images)
+    images = random_images(arguments.images, arguments.images // 10)
     measure(images, arguments.hidden, ANY_SIZE, arguments.repeats)
     measure(images, arguments.enumerated, ENUMERATED, arguments.repeats)
 

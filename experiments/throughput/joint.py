@@ -7,12 +7,12 @@ the field of the data is computed once an update; gradients need no autograd. Re
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from functools import partial
 from statistics import median
 
 import torch
+from common import Seconds
 from torch import Tensor
 from torch.optim import SGD
 
@@ -103,13 +103,6 @@ class ByHand:
         return torch.cat((self.w1.flatten(), self.w2.flatten()))
 
 
-def timed(run: Callable[[Tensor], object], v: Tensor) -> tuple[float, float]:
-    """Wall and processor seconds."""
-    wall, cpu = time.perf_counter(), time.process_time()
-    run(v)
-    return time.perf_counter() - wall, time.process_time() - cpu
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--images", type=int, default=2000, help="images of a pass")
@@ -119,10 +112,12 @@ def main() -> None:
     v = rng.bernoulli(torch.full((given.images, SIZES[0]), 0.5), generator=rng.stream(0, "images"))
     by_hand, (run_pass, coupling) = ByHand(), ours()
     runs = {"pretrain": run_pass, "by hand": by_hand.run_pass}
-    seconds = {name: list[tuple[float, float]]() for name in runs}
+    seconds = {name: list[Seconds]() for name in runs}
     for repeat in range(given.repeats + 1):
         for name, run in runs.items():
-            spent = timed(run, v)
+            begin = Seconds.now()
+            run(v)
+            spent = Seconds.now().since(begin)
             seconds[name] += [spent] if repeat else []  # the first pass warms up
         if not repeat:
             difference = float((coupling() - by_hand.coupling()).abs().max())

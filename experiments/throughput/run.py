@@ -9,42 +9,27 @@ import argparse
 import logging
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import lightning.pytorch as pl
 import torch
 import torch.nn.functional as F
+from common import N_VISIBLE, Seconds, random_images
 from lightning.pytorch.loggers import TensorBoardLogger
 from sklearn.neural_network import BernoulliRBM
 from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.callbacks import NegativePhaseEnergies, OptimizerMonitor, ReconstructionError
-from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule, PixelLayout
+from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.training import Greedy, pretrain
 from memcomp_lightning.training.given import Given
 
-N_VISIBLE, N_HIDDEN, BATCH, LEARNING_RATE, MOMENTUM = 784, 500, 100, 0.1, 0.5
-
-
-class Seconds(NamedTuple):
-    """Of an epoch; the second ones are the processor's, which other work on the machine changes less."""
-
-    wall: float
-    cpu: float
-
-    @staticmethod
-    def now() -> "Seconds":
-        return Seconds(time.perf_counter(), time.process_time())
-
-    def since(self, begin: "Seconds") -> "Seconds":
-        return Seconds(self.wall - begin.wall, self.cpu - begin.cpu)
+N_HIDDEN, BATCH, LEARNING_RATE, MOMENTUM = 500, 100, 0.1, 0.5
 
 
 class Clock(pl.Callback):
@@ -155,21 +140,6 @@ def finetuning_step_us(n_replicas: int, n_steps: int) -> float:
     )
     trainer.fit(module, train_dataloaders=Batches(v, label, BATCH, 10_000, True, 0))
     return module.wall_time_s / (n_epochs * 14) * 1e6
-
-
-def random_images(n: int) -> ImageData:
-    """Random binary images; the content does not matter for time."""
-    v = rng.bernoulli(torch.full((n, N_VISIBLE), 0.5), generator=rng.stream(0, "images"))
-    label = torch.zeros(n, dtype=torch.int64)
-    return ImageData(
-        train_v=v,
-        train_label=label,
-        test_v=v[:1],
-        test_label=label[:1],
-        n_classes=1,
-        layout=PixelLayout(28, 28),
-        name="random",
-    )
 
 
 def main() -> None:
