@@ -74,7 +74,7 @@ class Run:
         """Raise a UserError unless the network has trained weights."""
         if not self.pretrained:
             raise UserError(
-                f"{self.path} was not pretrained: it has a classifier alone, and no model of the data. "
+                f"{self.path} was not pretrained: it has no energy model of the data. "
                 + ("Name its run folder." if self.path.is_file() else "Train with pretrain.iterations=20, say.")
             )
 

@@ -187,7 +187,7 @@ def test_a_run_without_pretraining_has_no_model(folder: Path, command: Command) 
     assert found.status == 0, found.err
     run = memcomp_lightning.load(folder / "alone")
     assert run.classifier is not None
-    with pytest.raises(UserError, match="was not pretrained: it has a classifier alone"):
+    with pytest.raises(UserError, match="was not pretrained: it has no energy model"):
         _ = run.model
     found = command("transform", "alone", "people.csv", "output=none.csv", folder=folder)
     assert "was not pretrained" in found.err
