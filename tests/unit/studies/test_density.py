@@ -204,7 +204,7 @@ def test_verdicts_count_peers_and_correct_for_the_number_of_lines() -> None:
     lines = density_verdicts(Densities(plan, peers, records))
     by_claim = {line.claim: line for line in lines}
     against_peers = next(line for line in lines if "ahead" in line.claim)
-    assert against_peers.test == "place 2 of 3"
+    assert against_peers.test == "place 2 of 3; -2.100, too few seeds: no test"
     assert against_peers.verdict == "does not hold"
     assert by_claim["t: MODE beats CD1"].verdict == "holds"
     # A second line of the same strength doubles the smaller p value.
@@ -214,6 +214,15 @@ def test_verdicts_count_peers_and_correct_for_the_number_of_lines() -> None:
         Densities(more, peers, [*records, record("other", [-4.5, -4.6, -4.7], seconds=[1.0, 6.3])])
     )
     assert float(twice[1].test.rpartition("p = ")[2]) == pytest.approx(2 * alone, rel=0.1)
+
+
+@pytest.mark.parametrize(("best_peer", "verdict"), [(-6.0, "holds"), (-5.11, "does not hold")])
+def test_a_model_is_ahead_where_seeds_do_not_explain_it(best_peer: float, verdict: str) -> None:
+    peers = {"coin": Peer(label="coin", axes={}, start={})}
+    peer = [record("coin", [best_peer], setting='{"bias": 1}') for _ in range(3)]
+    (line,) = density_verdicts(Densities(density(replicas=3), peers, [record("cd1", [-5.0, -5.1, -5.2]), *peer]))
+    assert line.test.startswith("place 1 of 2; ")
+    assert line.verdict == verdict
 
 
 def test_scores_are_exact_where_a_layer_is_small() -> None:
