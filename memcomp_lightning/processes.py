@@ -46,8 +46,10 @@ def processes(n: int, heard: Callable[..., object]) -> Iterator[Do[Any]]:
             begun.append(parallel(delayed(function)(one) for one in work))
             return begun[-1]
 
+        done = False
         try:
             yield do
+            done = True
         except BrokenProcessPool as error:
             reason = "a process was ended from outside, perhaps as memory ran out. Fewer of them need less"
             raise UserError(f"{reason}; what is finished is kept, and the same command goes on.") from error
@@ -57,7 +59,8 @@ def processes(n: int, heard: Callable[..., object]) -> Iterator[Do[Any]]:
                     results.throw(error)
             raise
         finally:
-            get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=True)
+            # Killed processes leave semaphores, about which Python complains at its end.
+            get_reusable_executor(reuse=True).shutdown(wait=True, kill_workers=not done)
 
 
 def say(*what: object) -> None:
