@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from memcomp_lightning.configuration.quoting import with_path
 from running import Outcome
 
 import memcomp_lightning
@@ -17,6 +16,7 @@ from memcomp_lightning.cli import arguments
 from memcomp_lightning.cli.arguments import from_folder, read
 from memcomp_lightning.cli.overrides import _check_options
 from memcomp_lightning.configuration.composition import composing
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
 
 Run = Callable[..., Outcome]
