@@ -76,7 +76,7 @@ def test_a_checkpoint_is_loaded(stopped: Path, run_command: Command) -> None:
     v = run.model.visible.sample(torch.zeros(5, 5), generator=rng.stream(0, "v"))
     assert again.classifier is not None
     assert torch.equal(again.classifier(v), run.classifier(v))
-    with pytest.raises(UserError, match=r"no model of the data\. Name its run folder"):
+    with pytest.raises(UserError, match=r"no energy model of the data\. Name its run folder"):
         _ = again.model
     assert torch.equal(load("moved.pt", schema=run.schema).model.free_energy(v), run.model.free_energy(v))
     own = DBN(visible=run.schema.units(), hidden_sizes=[4])
