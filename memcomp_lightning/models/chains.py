@@ -21,10 +21,12 @@ def sweep(model: "RBM", v: Tensor, *, beta: float | Tensor = 1.0, generator: Gen
     Leaves the distribution ``exp(-beta E) / Z(beta)`` invariant. Values of ``v`` between 0 and 1 are taken as
     they are in the first half of the sweep.
     """
-    return _swept(model, v, beta, generator)[0]
+    return swept(model, v, beta=beta, generator=generator)[0]
 
 
-def _swept(model: "RBM", v: Tensor, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
+@torch.no_grad()
+def swept(model: "RBM", v: Tensor, *, beta: float | Tensor = 1.0, generator: Generator) -> tuple[Tensor, Tensor]:
+    """As :func:`sweep`; return the new v, and the h that it was drawn from."""
     h = model.draw_hidden(v, beta=beta, generator=generator)
     return model.draw_visible(h, beta=beta, generator=generator), h
 
@@ -52,7 +54,7 @@ class TwoLayerChains:
 
     def swept_with_energy(self, x: Tensor, *, beta: float | Tensor, generator: Generator) -> tuple[Tensor, Tensor]:
         """Draw h given v, then v given h; the energy of both that beta multiplies."""
-        v, h = _swept(self._model, x, beta, generator)
+        v, h = swept(self._model, x, beta=beta, generator=generator)
         return v, self._model.tempered_energy(v, h)
 
     def read(self, x: Tensor) -> Configurations:

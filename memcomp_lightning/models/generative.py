@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.base import PerState, Readout, Visible
+from memcomp_lightning.models.chains import swept
 from memcomp_lightning.models.conditional import Conditional
 from memcomp_lightning.models.dbn import DBN
 from memcomp_lightning.models.rbm import RBM
@@ -167,8 +168,7 @@ class GenerativeDBN(nn.Module):
         h = None
         for _ in range(sweeps):
             x = x if held is None else self._beside(x[..., : self.n_below], held)
-            h = self.top.draw_hidden(x, generator=generator)
-            x = self.top.draw_visible(h, generator=generator)
+            x, h = swept(self.top, x, generator=generator)
         if visible == "mean" and not self.generative:
             assert h is not None
             return self.top.visible_mean(h)[..., : self.n_below]

@@ -1,6 +1,7 @@
 """Comparisons of samplers by likelihood: each at its best learning rate, and what mode assistance brings."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -209,12 +210,15 @@ def _verdict(worth: Worth, data_set: str, method: str, opponent: str, p: float) 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p values for testing several hypotheses (Holm 1979): the family-wise error stays below the level.
 
-    >>> holm([0.01, 0.5, 0.02])
-    [0.03, 0.5, 0.04]
+    NaN stands for what was not tested: it stays NaN and does not count.
+
+    >>> holm([0.01, 0.5, math.nan, 0.02])
+    [0.03, 0.5, nan, 0.04]
     """
-    adjusted, largest = [0.0] * len(p_values), 0.0
-    for rank, index in enumerate(np.argsort(p_values)):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[index]))
+    adjusted, largest = [math.nan] * len(p_values), 0.0
+    n_tested = len(p_values) - int(np.isnan(p_values).sum())
+    for rank, index in enumerate(np.argsort(p_values)[:n_tested]):  # which puts NaN last
+        largest = max(largest, min(1.0, (n_tested - rank) * p_values[index]))
         adjusted[index] = largest
     return adjusted
 

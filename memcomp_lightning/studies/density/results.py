@@ -149,11 +149,8 @@ def density_verdicts(results: Densities) -> list[Verdict]:
     """Against the peers, a line a table; of the negative phases, a line a table and phase."""
     lines = [*_against_peers(results), *_of_phases(results)]
     tests = [_welch(line) for line in lines]
-    adjusted = iter(holm([float(test.pvalue) for test in tests if test is not None]))
-    return [
-        _verdict(line, test, math.nan if test is None else next(adjusted))
-        for line, test in zip(lines, tests, strict=True)
-    ]
+    p_values = holm([math.nan if test is None else float(test.pvalue) for test in tests])
+    return [_verdict(line, test, p) for line, test, p in zip(lines, tests, p_values, strict=True)]
 
 
 def _welch(line: _Line) -> Any:

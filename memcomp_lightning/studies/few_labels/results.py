@@ -154,10 +154,8 @@ def worth_note(results: Accuracies) -> str:
 
 def _judged(results: Accuracies) -> list[tuple[_Line, Verdict]]:
     lines = [line for n in results.labels for claim in results.plan.claims if (line := _line(results, n, claim))]
-    adjusted = iter(holm([line.gain.p for line in lines if not math.isnan(line.gain.p)]))
-    return [
-        (line, _verdict(results, line, math.nan if math.isnan(line.gain.p) else next(adjusted))) for line in lines
-    ]
+    p_values = holm([line.gain.p for line in lines])
+    return [(line, _verdict(results, line, p)) for line, p in zip(lines, p_values, strict=True)]
 
 
 def _line(results: Accuracies, n: Labels, claim: Claim) -> _Line | None:
