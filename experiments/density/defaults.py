@@ -29,6 +29,7 @@ from memcomp_lightning.studies.density.trial import independent_bits
 RESULTS = Path(__file__).with_name("defaults.csv")
 COLUMNS = ["table", "sampler", "rate", "hidden", "updates", "best", "last", "independent", "seconds"]
 OVERRIDES = ["experiment=density", "density.patience=1000", "density.points=9"]
+WITHOUT_PENALTY = {"l2": 0.0}
 AXES = {"rate": [0.05, 0.1, 0.2], "hidden": [64, 128], "updates": [10000]}
 
 
@@ -52,7 +53,7 @@ def train(samplers: list[str], tables: list[str] | None) -> None:
         key = (table, sampler, *map(str, values))
         if key in done:
             continue
-        setting = dict(zip(AXES, values, strict=True))
+        setting = {**WITHOUT_PENALTY, **dict(zip(AXES, values, strict=True))}
         trial = trial_of(density, [], table, files_of(density, table), sampler, setting, choosing=True)
         (record,) = trial.run(lambda what, n: None)
         valid = np.nan_to_num(record.measured("valid")[:, 0], nan=-np.inf)

@@ -30,8 +30,8 @@ SMALL = [
     "density.folder=tables",
     "density.tables=[small]",
     "density.only=[cd1,mode_cd,coin]",
-    "density.axes={rate: [0.1, 0.2], hidden: [3], updates: [20]}",
-    "density.start={rate: 0.1, hidden: 3, updates: 20}",
+    "density.axes={rate: [0.1, 0.2], l2: [0.001], hidden: [3], updates: [20]}",
+    "density.start={rate: 0.1, l2: 0.001, hidden: 3, updates: 20}",
     "density.replicas=2",
     "density.peer_replicas=1",
     "density.points=3",
@@ -68,7 +68,7 @@ def test_settings_are_searched_and_reported_once_and_a_run_goes_on(memcomp_train
     choosing = [record for record in found if record.choosing]
     assert {(record.method, record.setting) for record in choosing} == {
         *(
-            (name, json.dumps({"hidden": 3, "rate": r, "updates": 20}))
+            (name, json.dumps({"hidden": 3, "l2": 0.001, "rate": r, "updates": 20}))
             for name in ("cd1", "mode_cd")
             for r in (0.1, 0.2)
         ),
