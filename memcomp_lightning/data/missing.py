@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.models.observed import require_known_rows
 
 _ROWS = 2**14
 """That are looked at together."""
@@ -30,9 +31,7 @@ def split_missing(v: Tensor, observed: Tensor | None, name: str) -> tuple[Tensor
     require(observed.shape == v.shape, f"{name}.shape", tuple(observed.shape), f"{tuple(v.shape)}, as the data")
     if bool(observed.all()):
         return v, None
-    hidden = (~observed.any(-1)).nonzero()
-    row = hidden[0].tolist()[-1] if len(hidden) else 0
-    require(not len(hidden), f"{name}, values known in row {row}", 0, "one or more", "Leave out the row.")
+    require_known_rows(observed, name)
     parts = zip(v.split(_ROWS, -2), observed.split(_ROWS, -2), strict=True)
     if not any(bool(some.masked_fill(known, 0).any()) for some, known in parts):  # NaN is something
         return v, observed

@@ -74,7 +74,7 @@ def initial(shape: tuple[int, ...], weight_init: Initialiser | None, generator: 
 
 def independent_bias(
     v: Images, visible: Units | None = None, observed: Tensor | None = None, weight: Tensor | None = None
-) -> Float[Tensor, "*axes n_visible"]:
+) -> Float[Tensor, "*replicas n_visible"]:
     """Biases of units without couplings that have the data's means.
 
     Args:

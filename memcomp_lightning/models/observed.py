@@ -6,6 +6,7 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel, Hidden, Visible
+from memcomp_lightning.models.units import Units
 
 Observed = Bool[Tensor, "*replicas n n_visible"]
 """Where visible units are known; the entries of a categorical site are all known, or none of them."""
@@ -26,11 +27,23 @@ def check_mask(model: EnergyModel, v: Tensor, observed: Tensor) -> None:
     """Raise a SettingError for a mask of another shape, or one that hides half a site."""
     require(observed.shape == v.shape, "shape of observed", tuple(observed.shape), f"{tuple(v.shape)}, that of v")
     require(observed.dtype == torch.bool, "dtype of observed", str(observed.dtype), "torch.bool")
-    known = model.visible.site_sums(observed.to(v.dtype))
-    sizes = model.visible.site_sums(torch.ones(model.n_visible, dtype=v.dtype, device=v.device))
+    require_whole_sites(model.visible, observed)
+
+
+def require_whole_sites(units: Units, observed: Tensor) -> None:
+    """Raise a SettingError for a mask ``(*axes, n)`` that hides half a site."""
+    known = units.site_sums(observed.float())
+    sizes = units.site_sums(torch.ones(units.n, device=observed.device))
     half = ((known != 0) & (known != sizes)).nonzero()
     site = half[0].tolist()[-1] if len(half) else 0
     require(not len(half), f"observed entries of site {site}", "a part", "all entries of a site, or none")
+
+
+def require_known_rows(observed: Tensor, name: str) -> None:
+    """Raise a SettingError for a mask ``(*axes, n, n_sites)`` that hides a whole row."""
+    hidden = (~observed.any(-1)).nonzero()
+    row = hidden[0].tolist()[-1] if len(hidden) else 0
+    require(not len(hidden), f"{name}, values known in row {row}", 0, "one or more", "Leave out the row.")
 
 
 def visible_units_coupled(model: EnergyModel) -> bool:

@@ -62,7 +62,9 @@ class BlockAnnealing:
         lowest, at = energies.min(-1)
         best = Configurations(*(part.take_along_dim(at[..., None, None], dim=-2) for part in found[:2]))
         reached = (energies <= (lowest + 1e-6 * lowest.abs()).unsqueeze(-1)).float().mean(-1)
-        energy = integrated_energy(model, best).squeeze(-1).double()
+        # Hidden units without a form in bits (ReLU) are not integrated out: the lowest E itself was sought.
+        no_bits = model.hidden.real and model.hidden.curvature is None
+        energy = lowest if no_bits else integrated_energy(model, best).squeeze(-1).double()
         info = {"ground_state_energy": energy, "chains_at_best": reached}
         return NegativePhase(with_real_spread(model, best), state, info)
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning.errors import require
+from memcomp_lightning.models.observed import require_known_rows, require_whole_sites
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.types import UNLABELLED, Batch
 
@@ -23,7 +24,8 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
         units: The visible units, for categories and to check the shape; None takes tensors as they are.
 
     Raises:
-        SettingError: It is something else, or has columns or values that the model's units do not take.
+        SettingError: It is something else, has columns or values that the model's units do not take, a row without
+            any value, or half a site.
 
     >>> as_batch(torch.zeros(3, 2)).label.tolist()
     [-1, -1, -1]
@@ -39,12 +41,15 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
     observed = None
     if bool(v.isnan().any()):
         observed = ~v.isnan()
+        require_known_rows(observed, "batch")
         v = torch.where(observed, v, 0.0)
     if units is not None:
         if v.shape[-1] == units.n_sites != units.n:
             v = units.encode(v)
             observed = None if observed is None else units.over_sites(observed)
         require(v.shape[-1] == units.n, "columns of a batch", v.shape[-1], f"{units.n}, the visible units")
+        if observed is not None:
+            require_whole_sites(units, observed)
         units.check(v, observed)
     label = (
         torch.full(v.shape[:-1], UNLABELLED, dtype=torch.long, device=v.device) if len(parts) == 1 else parts[1]

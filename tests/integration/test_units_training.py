@@ -84,7 +84,7 @@ def test_neighbours_in_a_picture_without_corners(memcomp_train: Run) -> None:
     [
         (
             ["units=gaussian", "units.variance=0"],
-            "variance of column 0 = 0.0 is not allowed: expected a finite number > 0",
+            "variance of column 0 = 0.0 is not allowed: expected a number > 0",
         ),
         (["units=gaussian", "model=boltzmann", "pretrain=boltzmann"], "expected no couplings between real units"),
         (["units=categorical", "units.q=0"], "q = 0 is not allowed"),

@@ -49,8 +49,9 @@ class Units(nn.Module):
     multiplies the field and leaves the measure: at zero a unit follows :math:`\mu` alone.
 
     A layer has *sites*, each of one or more *entries*: a categorical unit of q states is one site of q entries.
-    A kind of one's own is a subclass with ``mean``, ``sample``, ``mode`` and ``cumulant``; what it does not
-    define is refused by name where it is asked for. Parameters of its own carry the replica axes in front.
+    A kind of one's own is a subclass with ``mean``, ``sample``, ``mode``, ``cumulant`` and ``bias_of``;
+    what it does not define is refused by name where it is asked for. Parameters of its own carry the replica axes
+    in front.
 
     Attributes:
         n: Number of entries.

@@ -32,17 +32,19 @@ class Categorical(Units):
     [[0.0, 1.0, 1.0, 0.0, 0.0]]
     """
 
-    def __init__(self, n_sites: int | Sequence[int], q: int | None = None) -> None:
-        if isinstance(n_sites, int):
-            require_count("q", q if q is not None else 0)
-            require_count("n_sites", n_sites, minimum=0)
-            assert q is not None
-            sizes = [q] * n_sites
-        else:
+    def __init__(self, n_sites: int | Sequence[int] | Tensor, q: int | None = None) -> None:
+        if isinstance(n_sites, Sequence | Tensor):
             require(q is None, "q", q, "None where the number of states of each site is given")
-            sizes = [int(size) for size in n_sites]
-            for site, size in enumerate(sizes):
+            given = n_sites.tolist() if isinstance(n_sites, Tensor) else n_sites
+            for site, size in enumerate(given):
                 require_count(f"number of states of site {site}", size)
+            sizes = [int(size) for size in given]
+        else:
+            require_count("n_sites", n_sites, minimum=0)
+            require(q is not None, "q", q, "the number of states of every site, an integer >= 1")
+            require_count("q", q)
+            assert q is not None
+            sizes = [int(q)] * int(n_sites)
         super().__init__(sum(sizes))
         self.sizes = tuple(sizes)
         widest = max(sizes, default=1)

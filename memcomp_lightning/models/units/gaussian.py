@@ -1,6 +1,7 @@
 """Real units, normally distributed given their fields."""
 
 import math
+from numbers import Real
 from typing import ClassVar
 
 import torch
@@ -42,9 +43,12 @@ class Gaussian(Units):
 
     def __init__(self, n: int, *, variance: float | Tensor = 1.0, learned: bool = True) -> None:
         super().__init__(n)
+        require(
+            isinstance(variance, Real | Tensor), "variance", variance, f"a number > 0, or a tensor of {n} numbers"
+        )
         given = torch.as_tensor(variance, dtype=torch.float32, device="cpu")
         require(given.shape in ((), (n,)), "shape of variance", tuple(given.shape), f"() or ({n},)")
-        wrong = ~((given > 0) & given.isfinite()).expand(n)
+        wrong = ~_usable(given).expand(n)
         if bool(wrong.any()):
             column = int(wrong.nonzero()[0])
             _refuse_variance(float(given.expand(n)[column]), column)
@@ -126,7 +130,7 @@ class Gaussian(Units):
         """The values themselves, which may be outside of [0, 1]."""
         return x
 
-    def bias_of(self, total: Values, n: float | Tensor) -> Values:
+    def bias_of(self, total: Values, n: float | Tensor) -> Tensor:
         """Mean times precision."""
         return total / n * self.precision
 
@@ -139,7 +143,7 @@ class Gaussian(Units):
         """
         if not self.learned:
             return
-        usable = (variance > 0) & variance.isfinite()
+        usable = _usable(variance)
         if not bool(usable.all()):
             place = (~usable).nonzero()[0].tolist()
             _refuse_variance(float(variance[tuple(place)]), column + place[-1])
@@ -151,6 +155,11 @@ class Gaussian(Units):
         return Bits(torch.arange(0, device="cpu"), torch.zeros(0, device="cpu"), torch.zeros(0, device="cpu"))
 
 
+def _usable(variance: Tensor) -> Tensor:
+    """Whether numbers are variances: of the smallest ones the precision would not be finite."""
+    return (variance > 0) & variance.isfinite() & variance.reciprocal().isfinite()
+
+
 def _refuse_variance(value: float, column: int) -> None:
-    allowed = "a finite number > 0 for Gaussian units"
+    allowed = "a number > 0 for Gaussian units, finite and with a finite inverse"
     require(False, f"variance of column {column}", value, allowed, "Leave out columns that are constant.")

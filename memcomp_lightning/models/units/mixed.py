@@ -23,6 +23,10 @@ class Mixed(Units):
 
     def __init__(self, *parts: Units) -> None:
         require(bool(parts), "parts of mixed units", len(parts), "one kind of units or more")
+        for part in parts:
+            require(
+                isinstance(part, Units), "part of mixed units", part, "a kind of memcomp_lightning.models.units"
+            )
         super().__init__(sum(part.n for part in parts))
         self.parts = nn.ModuleList(parts)
         self._sizes = [part.n for part in parts]
@@ -159,11 +163,14 @@ class Mixed(Units):
         """Of each part."""
         return self._each(lambda kind, part: kind.values_of(part, generator=generator), mean)
 
-    def bias_of(self, total: Values, n: float | Tensor) -> Values:
+    def bias_of(self, total: Values, n: float | Tensor) -> Tensor:
         """Of each part."""
         counts: Sequence[float | Tensor] = self._split(n) if isinstance(n, Tensor) else [n] * len(self.kinds)
         parts = zip(self.kinds, self._split(total), counts, strict=True)
-        return torch.cat([kind.bias_of(part, count) for kind, part, count in parts], dim=-1)
+        biases = [kind.bias_of(part, count) for kind, part, count in parts]
+        # Precisions have the replica axis, data need not have it.
+        axes = torch.broadcast_shapes(*(bias.shape[:-1] for bias in biases))
+        return torch.cat([bias.expand(*axes, -1) for bias in biases], dim=-1)
 
     def start(self, mean: Values, variance: Values, *, column: int = 0) -> None:
         """Each part."""
