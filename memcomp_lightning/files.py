@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and files of others, which are read with care."""
 
 import csv
 import io
@@ -8,6 +8,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from typing import Any
+
+from memcomp_lightning.errors import UserError
+
+LARGEST_JSON = 256 * 2**20
+"""Bytes of a file that is read whole: more than any that this package writes."""
 
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar("waiting", default=None)
 """Files that are written, by their places, to which they move together; None where each moves by itself."""
@@ -59,3 +65,30 @@ def as_csv(rows: Iterable[Iterable[object]]) -> str:
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(rows)
     return buffer.getvalue()
+
+
+def read_json(path: Path) -> Any:
+    """Plain values of a file.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: It is too large, nested too deeply, or no JSON.
+    """
+    if (size := path.stat().st_size) > LARGEST_JSON:
+        raise ValueError(f"it has {size} bytes, more than the {LARGEST_JSON} that are read")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The place of a name in a folder.
+
+    Raises:
+        UserError: The name leads out of the folder, as it may where a stranger wrote it.
+    """
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{folder}: the name {name!r} leads out of this folder, where nothing is read or written.")
+    return path

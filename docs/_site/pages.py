@@ -42,8 +42,12 @@ SHOWN = (".md", ".png", ".svg", ".csv", ".json")
 TOP_PAGES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
     "tests/downstream/README.md": "downstream.md",
 }
+
+LAST = [{"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}, {"Security": "security.md"}]
+"""Pages at the end of the menu."""
 
 GROUP_TEXTS = {
     "callbacks": "What is looked at while training runs; [all callbacks](../callbacks.md).",
@@ -93,7 +97,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     ]
     nav = [*(config.nav or [])]
     nav[2:2] = [{"Configuration": settings}, {"Results": measured}]
-    config.nav = [*nav, {"API": api}, {"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}]
+    config.nav = [*nav, {"API": api}, *LAST]
     return config
 
 

@@ -82,7 +82,7 @@ def check_command_line(
     overrides = list(line.overrides)
     if line.config_dir is not None:
         _check_groups(line.config_dir)
-        overrides = _with_search_path(overrides, line.config_dir)
+        overrides = with_search_path(overrides, line.config_dir)
     key = "hydra.sweep.dir" if line.multirun else "hydra.run.dir"
     if not line.shows:
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
@@ -227,7 +227,8 @@ def _of_another_kind(config_name: str, job: Sequence[str], paths: Sequence[str])
         name = name.lstrip("+")
         if not equals or "." not in name or name.startswith("hydra."):
             continue
-        before, value = OmegaConf.select(defaults, name), parse(override).value()
+        before = OmegaConf.select(defaults, name, throw_on_resolution_failure=False)
+        value = parse(override).value()
         if isinstance(before, ListConfig) and not isinstance(value, list | NoneType):
             return f"{name} = {value!r} is not allowed: expected a list. Write {name}=[{text.strip('()')}]"
         if isinstance(before, DictConfig) and not isinstance(value, dict | NoneType):
@@ -277,8 +278,10 @@ def search_path(settings: HydraConf) -> list[str]:
     return [f"{SEARCH_PATH}{places}"] if places else []
 
 
-def _with_search_path(overrides: Sequence[str], folder: Path) -> list[str]:
+def with_search_path(overrides: Sequence[str], folder: Path | None) -> list[str]:
     """The overrides with a folder of ``--config-dir`` as one of the places where they look for groups."""
+    if folder is None:
+        return list(overrides)
     given = search_paths(overrides)
     others = parse(given[-1]).value() if given else []
     assert isinstance(others, list)

@@ -6,7 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -21,8 +21,28 @@ from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import written_together
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.trained.alone import LoadWarning
+from memcomp_lightning.trained.run import Run, load
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class OfRun:
+    """Settings of every command that uses a trained run.
+
+    Attributes:
+        replica: Which of the networks of a run with data.partitions, from 0.
+        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
+        trusted: Packages of your own whose parts the run may name, '[your_package]'; parts of others are refused.
+    """
+
+    replica: int | None = None
+    schema: str | None = None
+    trusted: list[str] | None = None
+
+    def load(self, path: str) -> Run:
+        """The run, or the file, that was typed."""
+        return load(path, replica=self.replica, schema=self.schema, trusted=self.trusted or ())
 
 
 @dataclass(frozen=True)
@@ -33,7 +53,7 @@ class Usage(Generic[T]):
         command: Its name.
         purpose: What it does, a sentence.
         places: Names of what comes before the settings: ``("RUN",)`` or ``("RUN", "TABLE")``.
-        settings: A dataclass; its docstring's section *Attributes* explains them.
+        settings: A dataclass; its docstring's section *Attributes*, and those of its bases, explain them.
         examples: Lines that people may type, each with what it does.
         optional: How many of the places, from the end, may be left out.
     """
@@ -89,8 +109,8 @@ class Usage(Generic[T]):
     @property
     def help(self) -> str:
         """What ``--help`` prints."""
-        text = inspect.getdoc(self.settings) or ""
-        explained = inspect.cleandoc(text.partition("Attributes:\n")[2])
+        texts = (inspect.cleandoc(kind.__doc__ or "") for kind in self.settings.__mro__ if is_dataclass(kind))
+        explained = "\n".join(inspect.cleandoc(text.partition("Attributes:\n")[2]) for text in texts)
         defaults = {
             field.name: field.default
             for field in dataclasses.fields(self.settings)  # type: ignore[arg-type]

@@ -72,7 +72,8 @@ def earlier_of(config: DictConfig) -> Earlier | None:
     if config.get("continue") is None:
         return None
     folder = finished(Path(config["continue"]))
-    settings = cast(DictConfig, OmegaConf.load(folder.path / "settings.yaml"))
+    settings = folder.settings
+    assert settings is not None
     require(config.model.weights is None, "model.weights", config.model.weights, "null with continue=FOLDER")
     allowed = "null with continue=FOLDER: what is chosen trains new networks"
     require(config.choose is None, "choose", config.choose, allowed)
@@ -99,9 +100,9 @@ def finished(path: Path) -> RunFolder:
         UserError: It is none; the message says what to type.
     """
     folder = RunFolder(path)
-    if folder.overrides is None or not (path / "settings.yaml").is_file():
+    config = folder.settings
+    if folder.overrides is None or config is None:
         raise UserError(f"continue={path}: there is no overrides.json. Name the folder of a run of memcomp-train.")
-    config = cast(DictConfig, OmegaConf.load(path / "settings.yaml"))
     if study_of(config) is not None:
         raise UserError(
             f"continue={path}: this is a figure or a comparison of many runs. Name the folder of one run."

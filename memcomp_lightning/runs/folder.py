@@ -7,15 +7,17 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
+import yaml
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.files import write_json, write_text
+from memcomp_lightning.files import read_json, write_json, write_text
 from memcomp_lightning.runs.paths import is_path
 
 
@@ -71,7 +73,32 @@ class RunFolder:
     def overrides(self) -> list[str] | None:
         """The command line that the folder was made with, None if it is not a run folder."""
         found = self._read("overrides.json")
-        return None if found is None else list(found["overrides"])
+        if found is None:
+            return None
+        overrides = found.get("overrides")
+        if not (isinstance(overrides, list) and all(isinstance(override, str) for override in overrides)):
+            raise UserError(f"{self.path / 'overrides.json'} is damaged: it holds no list of overrides.")
+        return overrides
+
+    @property
+    def settings(self) -> DictConfig | None:
+        """All settings of the run as they were written, None where there are none.
+
+        Raises:
+            UserError: They are damaged, too large, or use references of YAML, which could stand for anything.
+        """
+        path = self.path / "settings.yaml"
+        if not path.is_file():
+            return None
+        try:
+            if path.stat().st_size > _LARGEST_SETTINGS:
+                raise UserError(f"{path} has more than {_LARGEST_SETTINGS} bytes: it holds no settings of a run.")
+            text = path.read_text(encoding="utf-8")
+            if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+                raise UserError(f"{path} refers to its own parts (*NAME), as no settings of a run do.")
+            return cast(DictConfig, OmegaConf.create(text))
+        except (ValueError, yaml.YAMLError, OmegaConfBaseException, RecursionError) as error:
+            raise UserError(f"{path} is damaged ({type(error).__name__}): restore it.") from error
 
     @property
     def typed_in(self) -> Path:
@@ -80,14 +107,13 @@ class RunFolder:
 
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
         """Make the folder; a UserError if it cannot be written, or was made with other settings."""
-        settings = self.path / "settings.yaml"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            if settings.exists():
+            if (settings := self.settings) is not None:
                 self._check_same(settings, config)
             else:
                 write_json(self.path / "overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
-                write_text(settings, OmegaConf.to_yaml(config))
+                write_text(self.path / "settings.yaml", OmegaConf.to_yaml(config))
         except OSError as error:
             raise UserError(
                 f"run folder {self.path} cannot be written ({error.strerror}): choose another with "
@@ -157,8 +183,8 @@ class RunFolder:
         """Note that the last attempt did not fail."""
         (self.path / "error.json").unlink(missing_ok=True)
 
-    def _check_same(self, path: Path, config: DictConfig) -> None:
-        there, now = _flat(OmegaConf.load(path)), _flat(config)
+    def _check_same(self, settings: DictConfig, config: DictConfig) -> None:
+        there, now = _flat(settings), _flat(config)
         for name in sorted(there.keys() | now.keys()):
             old, new = there.get(name), now.get(name)
             if not (name.startswith(_FREE_TO_CHANGE) or old == new or self._same_path(name, old, new)):
@@ -176,11 +202,13 @@ class RunFolder:
     def _read(self, name: str) -> dict[str, Any] | None:
         path = self.path / name
         try:
-            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            content: dict[str, Any] = read_json(path)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:
             raise UserError(f"{path} is damaged ({error}): restore it, or choose another folder.") from None
+        if not isinstance(content, dict):
+            raise UserError(f"{path} is damaged (it holds no object): restore it, or choose another folder.")
         return content
 
 
@@ -200,6 +228,9 @@ def _source() -> str:
         digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:8]
 
+
+_LARGEST_SETTINGS = 2**20
+"""Bytes of a settings.yaml that is read."""
 
 _WORKERS = ("figure.workers", "worth.workers", "density.workers", "few_labels.workers")
 _FREE_TO_CHANGE = ("logger.", "checkpoint_every", "data.source.data_dir", "data.source.download", *_WORKERS)

@@ -28,8 +28,9 @@ def history_with(earlier: RunFolder, weights: str) -> list[dict[str, Any]]:
         earlier: That run, finished.
         weights: The stage whose weights it goes on from: "pretrain" or "finetune".
     """
-    result, settings = earlier.result, OmegaConf.load(earlier.path / "settings.yaml")
+    result, settings = earlier.result, earlier.settings
     assert result is not None
+    assert settings is not None
     last = {
         "run": str(earlier.path),
         "weights": weights,

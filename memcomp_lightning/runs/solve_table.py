@@ -1,13 +1,12 @@
 """Answers to many problems as one table: a row for each problem, solver and seed, with gaps to what is known."""
 
 import csv
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.files import as_csv, write_text
+from memcomp_lightning.files import as_csv, inside, read_json, write_text
 from memcomp_lightning.problems.files.numbers import NUMBER
 from memcomp_lightning.runs import table
 
@@ -115,7 +114,7 @@ def curves(rows: Sequence[Row], known: Mapping[str, str], folder: Path) -> dict[
         if not is_answer(row):
             continue
         try:
-            told = json.loads((folder / row["solution"]).read_text(encoding="utf-8")).get("curve", [])
+            told = read_json(inside(folder, row["solution"])).get("curve", [])
         except (OSError, ValueError):
             told = []
         sign, reference = -1 if row["direction"] == "maximise" else 1, compared[row["file"]]

@@ -15,7 +15,7 @@ from torch import Tensor
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.files import written_whole
+from memcomp_lightning.files import inside, written_whole
 from memcomp_lightning.models import joint_model, stacked
 from memcomp_lightning.modules import EnergyPretraining
 from memcomp_lightning.samplers import positive_phase
@@ -97,7 +97,7 @@ class LikelihoodTrial(Trial):
 
 def weights_path(folder: Path, record: Record) -> Path:
     """Final weights of a trial: a state dict of the model with its replicas, the reported ones first."""
-    return folder / "weights" / f"{record.data_set}-{record.method}-{record.value:g}.pt"
+    return inside(folder / "weights", f"{record.data_set}-{record.method}-{record.value:g}.pt")
 
 
 def _add(record: Record, updates: int, seconds: float, values: Sequence[list[float]]) -> None:

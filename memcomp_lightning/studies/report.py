@@ -1,16 +1,15 @@
 """What a study shows, written into its folder: pictures, tables, verdicts, and its part of a page."""
 
 import io
-import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from matplotlib.figure import Figure
 
-from memcomp_lightning.errors import UserError
-from memcomp_lightning.files import as_csv, write_text, written_whole
+from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.files import as_csv, inside, read_json, write_text, written_whole
 from memcomp_lightning.studies.density import read_densities
 from memcomp_lightning.studies.density.events import write_events as density_events
 from memcomp_lightning.studies.density.plot import density_figures
@@ -41,14 +40,14 @@ def write_report(folder: Path) -> Section:
     """
     picture = folder / "figure2.png"
     if picture.exists():
-        notes = json.loads((folder / "figure2.json").read_text(encoding="utf-8"))
+        notes = read_json(folder / "figure2.json")
         return Section(notes["title"], [("Fig. 2", picture.read_bytes())], [], notes["notes"])
     notes, origin = [], folder / "origin.json"
     if origin.exists():
-        made_by = json.loads(origin.read_text(encoding="utf-8"))
+        made_by = read_json(origin)
         notes.append(", ".join(f"{key} {value}" for key, value in made_by.items()))
     shown = next((show for file, show in _BY_FILE.items() if (folder / file).exists()), _of_figure)(folder)
-    write_text(folder / f"{shown.name}.csv", shown.numbers)
+    write_text(inside(folder, f"{shown.name}.csv"), shown.numbers)
     write_text(folder / "verdicts.md", markdown(shown.verdicts))
     pictures = [(caption, save(folder, caption, figure)) for caption, figure in shown.figures.items()]
     notes += [*shown.notes, f"Numbers: {shown.name}.csv"]
@@ -67,8 +66,23 @@ class _Shown(NamedTuple):
     notes: Sequence[str] = ()
 
 
+T = TypeVar("T")
+
+
+def _read(reader: Callable[[Path], T], folder: Path) -> T:
+    """What a reader finds in a folder, whose files may be damaged, or of another version."""
+    try:
+        return reader(folder)
+    except SettingError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{folder}: its files are damaged, or another version wrote them ({type(error).__name__}: {error})"
+        ) from error
+
+
 def _of_worth(folder: Path) -> _Shown:
-    worth = read_worth(folder)
+    worth = _read(read_worth, folder)
     _check_measured(folder, bool(worth.data_sets))
     write_events(worth, folder / "tensorboard")
     figures = {data_set: plot_worth(worth, data_set) for data_set in worth.data_sets}
@@ -77,7 +91,7 @@ def _of_worth(folder: Path) -> _Shown:
 
 
 def _of_density(folder: Path) -> _Shown:
-    found = read_densities(folder)
+    found = _read(read_densities, folder)
     _check_measured(folder, bool(found.tables))
     density_events(found, folder / "tensorboard")
     plan, numbers = found.plan, as_csv(density_table(found))
@@ -85,7 +99,7 @@ def _of_density(folder: Path) -> _Shown:
 
 
 def _of_few_labels(folder: Path) -> _Shown:
-    found = read_few_labels(folder)
+    found = _read(read_few_labels, folder)
     _check_measured(folder, bool(found.labels))
     plan, numbers, judged = found.plan, as_csv(few_labels_table(found)), few_labels_verdicts(found)
     figures, notes = few_labels_figures(found), [worth_note(found)]
@@ -93,7 +107,7 @@ def _of_few_labels(folder: Path) -> _Shown:
 
 
 def _of_figure(folder: Path) -> _Shown:
-    results = read_results(folder)
+    results = _read(read_results, folder)
     _check_measured(folder, bool(results.curves))
     plan, notes = results.plan, [f"Training took {results.seconds / 60:.1f} min of one core."]
     title, figures = f"{plan.name}: {plan.data}, {plan.title}", accuracy_figures(results)
@@ -115,7 +129,7 @@ def save(folder: Path, name: str, figure: Figure) -> bytes:
     for suffix in ("svg", "png"):
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix, dpi=130)
-        with written_whole(folder / f"{name}.{suffix}") as path:
+        with written_whole(inside(folder, f"{name}.{suffix}")) as path:
             path.write_bytes(buffer.getvalue())
     write_event_file(folder, lambda writer: writer.add_figure(name, figure, close=False))
     return buffer.getvalue()

@@ -1,6 +1,5 @@
 """The records of a figure as curves, points and tables."""
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require_choice
-from memcomp_lightning.files import as_csv
+from memcomp_lightning.files import as_csv, read_json
 from memcomp_lightning.studies.records import Record, Records
 
 
@@ -177,4 +176,4 @@ def read_results(folder: Path) -> Results:
         raise FileNotFoundError(
             f"{folder} holds no figure.json: name the folder of a run like memcomp-train experiment=figure4."
         )
-    return Results(FigurePlan.of(json.loads(path.read_text(encoding="utf-8"))), Records(folder))
+    return Results(FigurePlan.of(read_json(path)), Records(folder))

@@ -1,6 +1,5 @@
 """Comparisons of samplers by likelihood: each at its best learning rate, and what mode assistance brings."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from memcomp_lightning.errors import require, require_choice, require_count, require_some
+from memcomp_lightning.files import read_json
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.records import Record, Records, best
 from memcomp_lightning.studies.verdicts import FAILS, HOLDS, Verdict
@@ -244,7 +244,7 @@ def read_worth(folder: Path) -> Worth:
     path = folder / "worth.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no worth.json: name the folder of experiment=sampler_worth.")
-    settings = json.loads(path.read_text(encoding="utf-8"))
+    settings = read_json(path)
     data_sets = {name: DataSet(**values) for name, values in settings["data_sets"].items()}
     methods = {name: Method(**values) for name, values in settings["methods"].items()}
     plan = Comparison(**{**settings, "data_sets": data_sets, "methods": methods})

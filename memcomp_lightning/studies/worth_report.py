@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from memcomp_lightning.files import inside
 from memcomp_lightning.studies.measures import MEASURES
 from memcomp_lightning.studies.worth import Worth
 
@@ -49,7 +50,7 @@ def write_events(worth: Worth, folder: Path) -> None:
     for method, own in worth.plan.methods.items():
         found = [data_set for data_set in worth.data_sets if method in worth.methods(data_set)]
         if found:
-            write_event_file(folder / own.label, partial(_write_method, worth, method, found))
+            write_event_file(inside(folder, own.label), partial(_write_method, worth, method, found))
     write_event_file(folder, lambda writer: writer.add_custom_scalars(charts))
 
 

@@ -1,6 +1,5 @@
 """Weights that lie by themselves: what their tensors say of the network, and what somebody has to say."""
 
-import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 
 from memcomp_lightning.data.schema import Schema, schema_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
+from memcomp_lightning.files import read_json
 from memcomp_lightning.models import DBN, RBM, Linear
 from memcomp_lightning.models.units import Bernoulli, Units
 from memcomp_lightning.modules.weights import CheckpointError, check_fits, read_checkpoint
@@ -61,7 +61,7 @@ def schema_in(path: Path) -> Schema:
         UserError: There is no such file, or it is something else.
     """
     try:
-        return schema_of(json.loads(path.read_text(encoding="utf-8")))
+        return schema_of(read_json(path))
     except OSError as error:
         raise UserError(
             f"schema={path}: {error.strerror}. Name the file schema.json of the run folder."

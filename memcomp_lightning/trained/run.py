@@ -3,15 +3,12 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
-from types import ModuleType
 from typing import Any, NamedTuple, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
-from memcomp_lightning import __version__
 from memcomp_lightning.configuration.networks import Shape, network_of, units_of_settings
 from memcomp_lightning.configuration.plans import classifier_of
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
@@ -19,6 +16,7 @@ from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.runs.folder import RunFolder
+from memcomp_lightning.runs.trust import check_targets, forget_lost_initialisers
 from memcomp_lightning.trained.alone import network_of as network_alone
 from memcomp_lightning.trained.alone import one_of, replica_of, schema_in, taken, tensors_of, warn
 
@@ -35,6 +33,7 @@ class Run:
         pretrained: Whether ``network`` has trained weights; of a run without pretraining only the classifier has.
         settings: All settings of the run, as plain values; empty without the folder.
         replica: Which of several networks that were trained side by side.
+        trusted: Packages of its user's own, whose parts its settings may name.
     """
 
     path: Path
@@ -44,6 +43,7 @@ class Run:
     settings: Mapping[str, Any] | None = None
     pretrained: bool = True
     replica: int = 0
+    trusted: Collection[str] = ()
 
     @property
     def model(self) -> EnergyModel:
@@ -180,8 +180,9 @@ def _of_file(path: Path, network: nn.Module | None, schema: Schema | None, repli
 
 
 def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place: _Place | None = None) -> Run:
-    folder, written = RunFolder(path), path / "settings.yaml"
-    if folder.overrides is None or not written.is_file():
+    folder = RunFolder(path)
+    config = folder.settings
+    if folder.overrides is None or config is None:
         raise UserError(f"{path} is no run folder of memcomp-train: it has no settings.yaml and overrides.json.")
     content = folder.schema
     if content is None:
@@ -189,12 +190,12 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
             f"{path} has no schema.json: its training has not begun, or was made by an earlier version. Go on "
             f"with memcomp-train resume={path}"
         )
-    schema, config = schema_of(content), cast(DictConfig, OmegaConf.load(written))
+    schema = schema_of(content)
     for part in ("units", "model", "finetune"):
         # Resolved, and for good: what an interpolation stands for is checked, too.
         config[part] = OmegaConf.to_container(config[part], resolve=True)
         if part == "model":
-            _forget_lost_initialisers(config.model)
+            forget_lost_initialisers(config.model)
         check_targets(OmegaConf.to_container(config[part]), part, path, trusted)
     n_replicas = _n_replicas(config)
     if n_replicas is None:
@@ -231,71 +232,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
         classifier = classifier_of(config, _network(config, schema), schema.n_classes).network.eval()
         _take(classifier, states["finetune"], files["finetune"], replica)
     settings = cast(dict[str, Any], OmegaConf.to_container(config))
-    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states, replica or 0)
-
-
-_PARTS = ("models", "data", "objective", "training", "samplers")
-_PACKAGES = (*(f"memcomp_lightning.{name}." for name in _PARTS), "torch.optim.")
-"""What classes of settings that are read here may be of: none of them does more than hold numbers or read data."""
-
-_FUNCTIONS = ("memcomp_lightning.interop.annealer_graph", "memcomp_lightning.models.connectivity.")
-"""Functions that list pairs of units, for a machine's connectivity."""
-
-
-def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = ()) -> None:
-    """Refuse settings that name other code than parts of a model: a folder may come from a stranger."""
-    if isinstance(node, dict) and (target := node.get("_target_")) is not None:
-        of_theirs = tuple(f"{package}." for package in trusted)
-        if not (_is_part(str(target)) or _is_of(str(target), of_theirs)):
-            if _is_lost(str(target)):
-                raise UserError(
-                    f"{path}: {name} is {target}, which this version, {__version__}, does not have: the run is of "
-                    "another one, which can still use it."
-                )
-            package = str(target).partition(".")[0]
-            raise UserError(
-                f"{path}: {name} is {target}, which is no part of a model of this package. If you trust it, in "
-                f"Python type load({str(path)!r}, trusted=[{package!r}])."
-            )
-    for key, value in (
-        node.items() if isinstance(node, dict) else enumerate(node if isinstance(node, list) else ())
-    ):
-        check_targets(value, f"{name}.{key}", path, trusted)
-
-
-def _forget_lost_initialisers(model: DictConfig) -> None:
-    """Leave out how weights began where this version has no such initialiser: they are those of the file."""
-    for name in ("weight_init", "output_init"):
-        settings = model.get(name)
-        if isinstance(settings, DictConfig) and _is_lost(str(settings.get("_target_"))):
-            model[name] = None
-
-
-def _is_lost(target: str) -> bool:
-    """Whether a name of this package is that of nothing in this version."""
-    return target.startswith("memcomp_lightning.") and _named(target) is None
-
-
-def _is_part(target: str) -> bool:
-    """Whether a name is that of a class, or function, that a model may be made of."""
-    found = _named(target)
-    if isinstance(found, type):
-        return _is_of(target, _PACKAGES)
-    return callable(found) and target.startswith(_FUNCTIONS) and _is_of(target, ("memcomp_lightning.",))
-
-
-def _is_of(target: str, packages: tuple[str, ...]) -> bool:
-    """Whether one of the packages defines what has this name, and does not only import it."""
-    return target.startswith(packages) and f"{getattr(_named(target), '__module__', '')}.".startswith(packages)
-
-
-def _named(target: str) -> Any:
-    """What has this name; a function rather than the module that it is named as."""
-    try:
-        found = resolve_name(target)
-    except (ImportError, AttributeError, ValueError):
-        return None
-    return getattr(found, target.rpartition(".")[2], found) if isinstance(found, ModuleType) else found
+    return Run(path, network.eval(), classifier, schema, settings, "pretrain" in states, replica or 0, trusted)
 
 
 def _network(config: DictConfig, schema: Schema) -> nn.Module:

@@ -1,16 +1,17 @@
 """The rows that a run was trained on, read again from where they lay."""
 
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from memcomp_lightning.configuration.rows import rows_of
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.paths import is_path
-from memcomp_lightning.trained.run import Run, check_targets
+from memcomp_lightning.runs.trust import check_targets
+from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import visible_of
 
 
@@ -37,12 +38,11 @@ def training_rows(run: Run, *, most: int = 10_000) -> TrainingRows:
         UserError: It does not say where its data are, or they are there no more, or have changed.
     """
     folder = RunFolder(run.path)
-    written = folder.path / "settings.yaml"
-    if folder.overrides is None or not written.is_file():
+    config = folder.settings
+    if folder.overrides is None or config is None:
         raise UserError(f"{run.path} lies by itself, and does not say where its data are")
-    config = cast(DictConfig, OmegaConf.load(written))
     source = _from_folder(OmegaConf.to_container(config.data.source, resolve=True), "data.source", folder.typed_in)
-    check_targets(source, "data.source", folder.path)
+    check_targets(source, "data.source", folder.path, run.trusted)
     if "download" in source:
         source["download"] = False
     config.data.source = source

@@ -65,7 +65,7 @@ def test_killed_run_goes_on_bit_for_bit(memcomp_train: Run, tmp_path: Path, stag
     assert process.returncode == -signal.SIGKILL, process.stderr
     assert torch.load(tmp_path / f"run/checkpoints/{stage}/last.ckpt", weights_only=True)["epoch"] == epoch - 1
     assert not (tmp_path / "run/result.json").exists()
-    outcome = memcomp_train("resume=run")
+    outcome = memcomp_train("resume=run", "trusted=[killing]")
     assert outcome.status == 0, outcome.err
     assert "test accuracy" in outcome.out
     found = weights(tmp_path)
@@ -76,6 +76,6 @@ def test_killed_run_goes_on_bit_for_bit(memcomp_train: Run, tmp_path: Path, stag
 def test_interrupt_says_how_to_go_on(tmp_path: Path) -> None:
     process = killed(tmp_path, "finetune", 1, "SIGINT")
     assert process.returncode == 130
-    assert "Go on with: memcomp-train resume=run" in process.stderr
+    assert "Go on with: memcomp-train resume=run 'trusted=[killing]'" in process.stderr
     assert "Traceback" not in process.stderr
     assert not list(tmp_path.rglob("*.partial"))

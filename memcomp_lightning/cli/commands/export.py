@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out
-from memcomp_lightning.trained import load
+from memcomp_lightning.cli.products import OfRun, Usage, carry_out
 from memcomp_lightning.trained.export import check_export, export
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(OfRun):
     """Settings of ``memcomp-export``.
 
     Attributes:
@@ -20,16 +19,12 @@ class Settings:
         what: classifier, features (means of the top hidden layer) or model; null is the classifier where there is
             one, else the features; safetensors, rbms and couplings hold the model.
         overwrite: Whether a file that is there is replaced.
-        replica: Which of the networks of a run with data.partitions, from 0.
-        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "model.safetensors"
     format: str | None = None
     what: str | None = None
     overwrite: bool = False
-    replica: int | None = None
-    schema: str | None = None
 
 
 USAGE = Usage(
@@ -55,7 +50,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Export a run."""
     output, what, overwrite = Path(settings.output), settings.what, settings.overwrite
     format = check_export(output, format=settings.format, what=what, overwrite=overwrite)
-    run = load(places[0], replica=settings.replica, schema=settings.schema)
+    run = settings.load(places[0])
     written = export(run, output, format=format, what=what, overwrite=overwrite)
     say(f"{output}: {written.holds}")
     for name in ("inputs", "outputs", "check", "use"):

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.cli.products import OfRun, Usage, carry_out, existing
 from memcomp_lightning.data.written import ENDINGS, TABLES, check_kind, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.likelihood.missing import MissingChains
 from memcomp_lightning.plotting.written import check_figures, write_figures
-from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import without_values
 from memcomp_lightning.trained.imputation import Imputation, completed_columns, gap_columns, impute
 from memcomp_lightning.trained.masking import figure_of_imputation, masked
@@ -23,7 +22,7 @@ MOST_FILES = 1_000
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(OfRun):
     """Settings of ``memcomp-impute``.
 
     Attributes:
@@ -38,8 +37,6 @@ class Settings:
         chains: Gibbs chains of each row, where there are too many hidden units for exact sums.
         sweeps: Sweeps of the last round of these chains at most.
         overwrite: Whether files that are there are replaced.
-        replica: Which of the networks of a run with data.partitions, from 0.
-        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "filled.csv"
@@ -50,8 +47,6 @@ class Settings:
     chains: int = 8
     sweeps: int = 1600
     overwrite: bool = False
-    replica: int | None = None
-    schema: str | None = None
 
 
 USAGE = Usage(
@@ -82,7 +77,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
         raise UserError(f"probabilities={gaps}: the completed table goes there. Choose another file.")
     if settings.figures is not None:
         check_figures(Path(settings.figures), overwrite=settings.overwrite)
-    run, table = load(places[0], replica=settings.replica, schema=settings.schema), existing(places[1])
+    run, table = settings.load(places[0]), existing(places[1])
     check_kind(outputs[0], run.needed_schema)
     chains = MissingChains(n_chains=settings.chains, most_sweeps=settings.sweeps)
     rows = run.needed_schema.read(table, complete=False)

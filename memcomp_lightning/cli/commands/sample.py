@@ -9,13 +9,12 @@ import numpy as np
 from torch import Tensor
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.cli.products import OfRun, Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.schema import Columns, ImageSchema, Schema
 from memcomp_lightning.data.written import check_kind, check_output, in_one_array, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import written_whole
-from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import others_of
 from memcomp_lightning.trained.given import given_row, unlike_training
 from memcomp_lightning.trained.imputation import completed_columns
@@ -29,7 +28,7 @@ N_PICTURES = 100
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(OfRun):
     """Settings of ``memcomp-sample``.
 
     Attributes:
@@ -41,8 +40,6 @@ class Settings:
         most_sweeps: Sweeps by which chains are judged at most; more of them where they do not mix.
         seed: Of all draws.
         overwrite: Whether files that are there are replaced.
-        replica: Which of the networks of a run with data.partitions, from 0.
-        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
         figure: A .png of the first 100, where rows are pictures.
         figures: Folder, .png or .pdf for figures of the rows beside those of data=TABLE.
         data: The table that figures compare with, say the one that was trained on.
@@ -56,8 +53,6 @@ class Settings:
     most_sweeps: int = 4096
     seed: int = 0
     overwrite: bool = False
-    replica: int | None = None
-    schema: str | None = None
     figure: str | None = None
     figures: str | None = None
     data: str | None = None
@@ -88,7 +83,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Draw rows, and write them."""
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite)
-    run = load(places[0], replica=settings.replica, schema=settings.schema)
+    run = settings.load(places[0])
     schema = run.needed_schema
     check_kind(output, schema)
     figure = None if settings.figure is None else _checked_figure(settings, schema)

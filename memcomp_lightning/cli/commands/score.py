@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.cli.products import OfRun, Usage, carry_out, existing
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.data.written import TABLES, check_output, write_columns
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.plotting.written import check_figures, write_figures
-from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import beside, left_out, without_values
 from memcomp_lightning.trained.figures import figure_of_scores
 from memcomp_lightning.trained.partition import Annealing
@@ -21,7 +20,7 @@ from memcomp_lightning.trained.scoring import Scores, score
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(OfRun):
     """Settings of ``memcomp-score``.
 
     Attributes:
@@ -34,8 +33,6 @@ class Settings:
             run, where they can still be read, and of samples of the model.
         seed: Of what is drawn.
         overwrite: Whether a file that is there is replaced.
-        replica: Which of the networks of a run with data.partitions, from 0.
-        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "scores.csv"
@@ -45,8 +42,6 @@ class Settings:
     figures: str | None = None
     seed: int = 0
     overwrite: bool = False
-    replica: int | None = None
-    schema: str | None = None
 
 
 USAGE = Usage(
@@ -67,7 +62,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     annealing = Annealing(
         n_chains=settings.chains, n_betas=min(Annealing().n_betas, settings.betas), most_betas=settings.betas
     )
-    run, table = load(places[0], replica=settings.replica, schema=settings.schema), existing(places[1])
+    run, table = settings.load(places[0]), existing(places[1])
     rows = run.needed_schema.read(table, complete=False)
     found = score(run, rows, pseudo=settings.pseudo, annealing=annealing, seed=settings.seed)
     if settings.figures is not None and "log_likelihood" not in found.columns:

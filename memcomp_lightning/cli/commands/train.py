@@ -7,6 +7,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -18,9 +19,9 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli import sweep
-from memcomp_lightning.cli.arguments import CommandLine, expanded, from_folder, read, unquoted
+from memcomp_lightning.cli.arguments import CommandLine, read
 from memcomp_lightning.cli.commands import report
-from memcomp_lightning.cli.continued import with_settings_of_run
+from memcomp_lightning.cli.continued import Written, to_trust, with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
 from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
 from memcomp_lightning.cli.search import check_searchable
@@ -31,7 +32,6 @@ from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
 from memcomp_lightning.configuration.plans import build, check_without_trainer
-from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.configuration.trainers import check_trainers, trainer_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError
@@ -102,6 +102,12 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     check_trainers(plans[0], config)
 
 
+def _check_trusted(written: Written, config: DictConfig, overrides: Sequence[str]) -> None:
+    """Build a job that goes on with a run, if it names nothing that is not trusted."""
+    written.check(config, overrides)
+    _check(config, overrides)
+
+
 def _studies(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[ModuleType, DictConfig, list[str]]]:
     """What checks and trains a comparison, or each figure of a run, with its settings, by the folder of each."""
     if (alone := _ALONE.get(study_of(config) or "")) is not None:
@@ -142,7 +148,7 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
                 choice=choice,
             )
         except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
-            raise KeyboardInterrupt(_go_on(folder)) from stop
+            raise KeyboardInterrupt(_go_on(folder, config, overrides)) from stop
     else:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
@@ -162,42 +168,18 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
             study.train(part, own, folder.path / name)
         report.main([*(str(folder.path / name) for name in studies), "--output", str(folder.report)])
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(_go_on(folder)) from stop
+        raise KeyboardInterrupt(_go_on(folder, config, overrides)) from stop
     folder.forget_error()
 
 
-def _go_on(folder: RunFolder) -> str:
-    return f"Go on with: {shlex.join([COMMAND, f'resume={short_path(folder.path)}'])}"
+def _go_on(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> str:
+    line = [COMMAND, f"resume={short_path(folder.path)}", *to_trust(config, overrides, folder.path)]
+    return f"Go on with: {shlex.join(line)}"
 
 
 def _is_first_process() -> bool:
     """Whether this is the process that writes; Lightning reads the rank from the environment."""
     return int(getattr(rank_zero_only, "rank", 0)) == 0
-
-
-def _resumed(arguments: list[str]) -> list[str]:
-    """Put the overrides and the folder of an earlier run in place of ``resume=FOLDER``."""
-    folders = [argument.partition("=")[2] for argument in arguments if argument.startswith("resume=")]
-    if not folders:
-        return arguments
-    name = unquoted(folders[-1])
-    if not name:
-        raise UserError("resume= names no folder: write resume=FOLDER, the folder of a run of memcomp-train.")
-    if {"-m", "--multirun"} & set(arguments):
-        raise UserError(
-            f"resume={name} goes on with one run, without -m; a sweep goes on when the same command is given with "
-            "hydra.sweep.dir=FOLDER."
-        )
-    folder = RunFolder(Path(expanded("resume", name)))
-    overrides = folder.overrides
-    if overrides is None:
-        raise UserError(
-            f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
-            "sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
-        )
-    earlier = [from_folder(override, folder.typed_in) for override in overrides]
-    others = [argument for argument in arguments if not argument.startswith("resume=")]
-    return [*earlier, *others, with_path("hydra.run.dir", folder.path)]
 
 
 def main() -> None:
@@ -206,10 +188,11 @@ def main() -> None:
     try:
         if "LOCAL_RANK" not in os.environ:
             try:
+                line, written = _read(sys.argv[1:])
                 line = check_command_line(
-                    _read(sys.argv[1:]),
+                    line,
                     config_name="config",
-                    check=_check,
+                    check=_check if written is None else partial(_check_trusted, written),
                     folders=("runs", "multirun"),
                     check_searchable=check_searchable,
                 )
@@ -232,15 +215,16 @@ def main() -> None:
         sys.exit(1 if n_failed else 0)
 
 
-def _read(arguments: list[str]) -> CommandLine:
-    line = read(with_settings_of_run(_resumed(arguments)))
+def _read(arguments: list[str]) -> tuple[CommandLine, Written | None]:
+    arguments, written = with_settings_of_run(arguments)
+    line = read(arguments)
     devices = line.value("trainer.devices")
     if line.multirun and devices not in (None, "1"):
         raise UserError(
             "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
             "processes. Give the jobs one by one, or use one device with a parallel launcher."
         )
-    return line
+    return line, written
 
 
 def _silence_lightning() -> None:

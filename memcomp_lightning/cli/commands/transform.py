@@ -5,15 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from memcomp_lightning.cli.output import say
-from memcomp_lightning.cli.products import Usage, carry_out, existing
+from memcomp_lightning.cli.products import OfRun, Usage, carry_out, existing
 from memcomp_lightning.data.written import TABLES, check_output, write_columns
-from memcomp_lightning.trained import load
 from memcomp_lightning.trained.beside import beside, left_out
 from memcomp_lightning.trained.features import transform
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(OfRun):
     """Settings of ``memcomp-transform``.
 
     Attributes:
@@ -21,15 +20,11 @@ class Settings:
             does not have come first.
         overwrite: Whether a file that is there is replaced.
         layer: Hidden layer, from 1; null is the top one.
-        replica: Which of the networks of a run with data.partitions, from 0.
-        schema: The schema.json of the run folder, where RUN is a weight file or a checkpoint that lies elsewhere.
     """
 
     output: str = "features.csv"
     overwrite: bool = False
     layer: int | None = None
-    replica: int | None = None
-    schema: str | None = None
 
 
 USAGE = Usage(
@@ -45,7 +40,7 @@ def act(places: Sequence[str], settings: Settings) -> None:
     """Transform a file."""
     output = Path(settings.output)
     check_output(output, overwrite=settings.overwrite, endings=TABLES)
-    run = load(places[0], replica=settings.replica, schema=settings.schema)
+    run = settings.load(places[0])
     table = existing(places[1])
     rows = run.needed_schema.read(table, complete=False)
     found = transform(run, rows, layer=settings.layer)

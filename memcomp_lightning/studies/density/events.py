@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from memcomp_lightning.files import inside
 from memcomp_lightning.studies.density.results import Densities
 from memcomp_lightning.studies.worth_report import write_event_file
 
@@ -19,7 +20,7 @@ def write_events(results: Densities, folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     for name in results.plan.models:
         if any(results.reported(table, name) for table in results.tables):
-            write_event_file(folder / results.label(name), partial(_write, results, name))
+            write_event_file(inside(folder, results.label(name)), partial(_write, results, name))
 
 
 def _write(results: Densities, name: str, writer: "SummaryWriter") -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from memcomp_lightning.files import read_json
 from memcomp_lightning.studies.comparison import half_width
 from memcomp_lightning.studies.density.peers import Peer
 from memcomp_lightning.studies.density.settings import Density, Model
@@ -254,7 +255,7 @@ def read_densities(folder: Path) -> Densities:
     path = folder / "density.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no density.json: name the folder of experiment=density.")
-    settings = json.loads(path.read_text(encoding="utf-8"))
+    settings = read_json(path)
     peers = {name: Peer(**own) for name, own in settings.pop("found_peers").items()}
     models = {name: Model(**own) for name, own in settings.pop("models").items()}
     return Densities(Density(**settings, models=models), peers, Records(folder).all)

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
+from memcomp_lightning.files import inside
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules.weights import load_weights
 from memcomp_lightning.studies.few_labels.data import Sets
@@ -116,7 +117,7 @@ class Context:
 
 def weight_file(folder: Path, name: str, seed: int) -> Path:
     """Where a pretraining leaves its weights."""
-    return folder / "pretrained" / f"{name}_{seed}.pt"
+    return inside(folder / "pretrained", f"{name}_{seed}.pt")
 
 
 class Learner(Protocol):

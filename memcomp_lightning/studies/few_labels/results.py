@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from memcomp_lightning.files import read_json
 from memcomp_lightning.studies.comparison import Comparison, accounts_for, compare, half_width
 from memcomp_lightning.studies.few_labels.settings import BEST, Claim, FewLabels, Method, Pretraining, Search
 from memcomp_lightning.studies.few_labels.trial import PRETRAINING, chosen_of
@@ -223,7 +224,7 @@ def read_few_labels(folder: Path) -> Accuracies:
     path = folder / "few_labels.json"
     if not path.exists():
         raise FileNotFoundError(f"{folder} holds no few_labels.json: name the folder of experiment=few_labels.")
-    settings = json.loads(path.read_text(encoding="utf-8"))
+    settings = read_json(path)
     parts = {"pretraining": Pretraining, "searches": Search, "methods": Method}
     own = {name: {key: kind(**one) for key, one in settings[name].items()} for name, kind in parts.items()}
     claims = [Claim(**claim) for claim in settings["claims"]]

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
+from memcomp_lightning.cli import products
 from memcomp_lightning.cli.commands import sample as command
 from memcomp_lightning.data.images import PixelLayout
 from memcomp_lightning.data.schema import ImageSchema
@@ -36,7 +37,7 @@ def use(tmp_path, monkeypatch):
     """Let the command find a run of this schema and model, and work in an empty folder."""
 
     def use(schema, model):
-        monkeypatch.setattr(command, "load", lambda path, **_: Run(tmp_path, model, None, schema, {}))
+        monkeypatch.setattr(products, "load", lambda path, **_: Run(tmp_path, model, None, schema, {}))
         monkeypatch.chdir(tmp_path)
         return tmp_path
 
@@ -203,7 +204,7 @@ def test_of_several_files_all_are_written_or_none(use, capsys, monkeypatch):
 
 def test_a_folder_that_cannot_be_written_is_refused_before_rows_are_drawn(table, capsys, monkeypatch):
     monkeypatch.setattr("os.access", lambda *_: False)
-    monkeypatch.setattr(command, "load", None)
+    monkeypatch.setattr(products, "load", None)
     assert "you may not write in its folder" in refused(capsys)
 
 
