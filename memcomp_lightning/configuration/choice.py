@@ -33,6 +33,7 @@ def tried_values(config: DictConfig) -> list[float]:
 
 def with_choice(config: DictConfig, value: float) -> DictConfig:
     """A copy in which the setting, which must exist, has this value and nothing is left to choose."""
+    require(type(value) in (int, float), "value that was chosen", value, "a number: records may be a stranger's")
     chosen, setting = copy.deepcopy(config), config.choose.get("setting")
     try:
         OmegaConf.update(chosen, str(setting), value)

@@ -1,8 +1,9 @@
 """Configurations composed by Hydra: of this package's groups, of the user's, and one curve's or method's own."""
 
 import functools
-from collections.abc import Iterable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 
 from hydra import compose, initialize_config_module
 from hydra.errors import ConfigCompositionException
@@ -24,6 +25,25 @@ _OF_MANY_RUNS = ("hydra.", *(f"{name}{mark}" for name in STUDIES for mark in "./
 """Overrides that say nothing of a single run."""
 
 
+Check = Callable[[DictConfig, Sequence[str]], object]
+"""Raises if a configuration may not be built; it gets the overrides as well."""
+
+_check: ContextVar[Check] = ContextVar("check", default=lambda config, overrides: None)
+
+
+@contextmanager
+def checking(check: Check | None) -> Iterator[None]:
+    """Let the configuration of each curve or method be checked: its overrides are texts in those of a study."""
+    if check is None:
+        yield
+        return
+    before = _check.set(check)
+    try:
+        yield
+    finally:
+        _check.reset(before)
+
+
 def composing() -> AbstractContextManager[None]:
     """The context in which :func:`composed_for` and Hydra's ``compose`` find our groups, outside of a command."""
     return initialize_config_module(CONFIG_MODULE, **INITIALIZE)
@@ -42,12 +62,16 @@ def search_paths(overrides: Iterable[str]) -> list[str]:
 def composed_for(common: Iterable[str], own: Iterable[str] = ()) -> DictConfig:
     """The configuration of one curve or method, without settings of its study; cached, so do not change it.
 
+    It raises what :func:`checking` raises.
+
     Overrides of the whole study that this curve or method has no setting for are left out: ``solver.max_steps``
     where its solver is descent. Its own must apply.
     """
     common = tuple(common)
     of_one = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
-    return _composed(tuple(search_paths(common)), of_one, tuple(own))
+    found = _composed(tuple(search_paths(common)), of_one, tuple(own))
+    _check.get()(found, (*common, *own))
+    return found
 
 
 @functools.cache

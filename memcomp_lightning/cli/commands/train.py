@@ -27,7 +27,7 @@ from memcomp_lightning.cli.overrides import answering, check_command_line, searc
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.configuration import comparisons, densities, few_labels, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
-from memcomp_lightning.configuration.composition import CONFIG_MODULE, study_of
+from memcomp_lightning.configuration.composition import CONFIG_MODULE, checking, study_of
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
@@ -187,20 +187,21 @@ def main() -> None:
     _silence_lightning()
     try:
         if "LOCAL_RANK" not in os.environ:
-            try:
-                line, written = _read(sys.argv[1:])
-                line = check_command_line(
-                    line,
-                    config_name="config",
-                    check=_check if written is None else partial(_check_trusted, written),
-                    folders=("runs", "multirun"),
-                    check_searchable=check_searchable,
-                )
-            except OSError as error:
-                raise UserError(in_words(error)) from error
-            sys.argv[1:] = line.arguments
-            with answering(line):
-                train()
+            line, written = _read(sys.argv[1:])
+            with checking(None if written is None else written.check):
+                try:
+                    line = check_command_line(
+                        line,
+                        config_name="config",
+                        check=_check if written is None else partial(_check_trusted, written),
+                        folders=("runs", "multirun"),
+                        check_searchable=check_searchable,
+                    )
+                except OSError as error:
+                    raise UserError(in_words(error)) from error
+                sys.argv[1:] = line.arguments
+                with answering(line):
+                    train()
         else:
             train()
     except UserError as error:
