@@ -17,15 +17,16 @@ from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS
 from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.runs.trust import foreign
+from memcomp_lightning.runs.paths import is_path
+from memcomp_lightning.runs.trust import foreign, require_no_links
 
 _BEGINS = ("continue", "model.weights")
 """Settings that say where a run began."""
 
 _TRUSTED = "trusted="
 
-_ACTING = ("callbacks", "launcher", "sweeper", "job_logging", "hydra_logging")
-"""Parts of Hydra's settings that name code."""
+_PLAIN = re.compile(r"[\w./:@+~ -]+")
+"""What a name may consist of to be told as one to trust."""
 
 
 @dataclass(frozen=True)
@@ -51,64 +52,75 @@ class Written:
             UserError: They set what Hydra does, or look for settings where nobody trusts them.
         """
         found = [from_folder(override, self.folder.typed_in) for override in self.folder.overrides or []]
+        if self.setting == "continue" and (choice := (self.folder.result or {}).get("choice")):
+            if type(choice.get("value")) not in (int, float):
+                raise UserError(f"continue={self.folder.path}: result.json is damaged: its choice is no number.")
+            chosen = [f"{choice['setting']}={choice['value']}", "choose=null"]
+            found = [*(o for o in found if _name(o) not in map(_name, chosen)), *chosen]
         for override in found:
-            parsed = parse(override)
-            if "hydra" in (
-                re.split("[./]", name)[0] for name in (parsed.key_or_group or "", parsed.package or "")
-            ):
-                if override.startswith(SEARCH_PATH):
-                    continue
-                raise UserError(
-                    f"{self.setting}={self.folder.path}: {override} sets what Hydra does, which no run keeps: "
-                    "somebody wrote it there."
-                )
-        places = foreign(DictConfig({}), _search_path(found), self.folder.path)
-        self._refuse({place: where for place, where in places.items() if place not in self._places_typed()})
+            self._check_text(override)
+        self._refuse({entry: f"{entry}, where settings would be looked for" for entry in self._places(found)})
         return found
 
-    def check(self, config: DictConfig, overrides: Sequence[str]) -> None:
-        """Raise a UserError where settings name what neither this package has, nor was typed, nor is trusted."""
-        self._refuse_other_hydra(overrides)
-        names = foreign(config, _search_path(overrides), self.folder.path)
+    def _check_text(self, override: str) -> None:
+        """Raise a UserError for what could stand for anything, or lead Hydra elsewhere."""
+        parsed, name = parse(override), _name(override)
+        key, text = parsed.key_or_group or "", override.partition("=")[2]
+        names = re.split("[./@]", f"{key}.{parsed.package}")
+        of_group = "." not in key and isinstance(parsed.value(), str)
+        says = None
+        if "hydra" in names and not override.startswith(SEARCH_PATH):
+            says = "sets what Hydra does"
+        elif "${" in text:
+            says = "could stand for anything"
+        elif not is_path(name) and (".." in re.split(r"[^\w.]", text) or (of_group and {"/", "\\"} & set(text))):
+            says = "leads to another folder"
+        if says is not None:
+            at = f"{self.setting}={self.folder.path}"
+            remedy = f"If it was you, give the whole command again, with hydra.run.dir={self.folder.path}."
+            raise UserError(f"{at}: {override!r} {says}; somebody typed or wrote it. {remedy}")
+
+    def _places(self, overrides: Sequence[str]) -> list[str]:
+        """Places where the run, and nobody who typed, looks for groups of settings."""
+        return [entry for entry in _search_path(overrides) if entry not in _search_path(self._overrides_typed())]
+
+    def check(self, config: DictConfig, own: Sequence[str] = ()) -> None:
+        """Raise a UserError where settings name what neither this package has, nor was typed, nor is trusted.
+
+        Args:
+            config: All settings of a command, or of a curve or method of a study.
+            own: Overrides of the curve or method, which stand as texts in the settings of its study.
+        """
+        for override in own:
+            self._check_text(override)
+        names = foreign(config, self.folder.path)
         if names.keys() - set(self.trusted):
             names = {name: where for name, where in names.items() if name not in self._names_typed()}
         self._refuse(names)
-
-    def _refuse_other_hydra(self, overrides: Sequence[str]) -> None:
-        """Raise where a file among the run's own settings sets what Hydra does."""
-        if not search_paths(overrides):
-            return
-        typed = [override for override in self._overrides_typed() if override.lstrip("+~").startswith("hydra")]
-        here, ours = (compose("config", list(some), return_hydra_config=True).hydra for some in (overrides, typed))
-        for part in _ACTING:
-            if here.get(part) != ours.get(part):
-                raise UserError(
-                    f"{self.setting}={self.folder.path}: a file of its settings sets hydra.{part}, which no run "
-                    "needs: somebody wrote it there."
-                )
 
     def _overrides_typed(self) -> list[str]:
         line = read(self.typed)
         return with_search_path(line.overrides, line.config_dir)
 
-    def _places_typed(self) -> Collection[str]:
-        return foreign(DictConfig({}), _search_path(self._overrides_typed()), self.folder.path)
-
     def _names_typed(self) -> Collection[str]:
         """What was typed is trusted like code."""
         try:
-            config = compose("config", self._overrides_typed())
+            return foreign(compose("config", self._overrides_typed()), self.folder.path)
         except CONFIGURATION_ERRORS:
-            return self._places_typed()
-        return {**foreign(config, (), self.folder.path), **dict.fromkeys(self._places_typed())}
+            return ()
 
     def _refuse(self, names: Mapping[str, str]) -> None:
-        if unknown := [name for name in names if name not in self.trusted]:
-            line = [f"{self.setting}={self.folder.path}", f"{_TRUSTED}[{','.join(names)}]", *self.typed]
-            raise UserError(
-                f"{self.setting}={self.folder.path}: its settings name {names[unknown[0]]}, which is no part of "
-                f"this package and could do anything. If you trust it, type memcomp-train {shlex.join(line)}"
-            )
+        unknown = [name for name in names if name not in self.trusted]
+        if not unknown:
+            return
+        shown = repr(names[unknown[0]])[1:-1]  # without what moves a terminal's cursor
+        said = f"{self.setting}={self.folder.path}: its settings name {shown}, which is no part of this"
+        if not all(_PLAIN.fullmatch(name) for name in names):
+            raise UserError(f"{said} package and could do anything.")
+        line = [f"{self.setting}={self.folder.path}", f"{_TRUSTED}[{','.join(names)}]", *self.typed]
+        raise UserError(
+            f"{said} package and could do anything. If you trust it, type memcomp-train {shlex.join(line)}"
+        )
 
 
 def with_settings_of_run(arguments: Sequence[str]) -> tuple[list[str], Written | None]:
@@ -136,7 +148,7 @@ def with_settings_of_run(arguments: Sequence[str]) -> tuple[list[str], Written |
 
 def to_trust(config: DictConfig, overrides: Sequence[str], folder: Path) -> list[str]:
     """Arguments that a command needs to go on with a run: what it names that is not of this package."""
-    names = foreign(config, _search_path(overrides), folder)
+    names = [*foreign(config, folder), *_search_path(overrides)]
     return [f"{_TRUSTED}[{','.join(names)}]"] if names else []
 
 
@@ -163,6 +175,7 @@ def _resumed(name: str, arguments: Sequence[str], trusted: Collection[str]) -> t
             f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
             "sweep goes on when the same command is given with hydra.sweep.dir=FOLDER."
         )
+    require_no_links(folder.path)
     typed = [argument for argument in arguments if not argument.startswith("resume=")]
     written = Written("resume", folder, typed, trusted)
     return [*written.overrides(), *typed, with_path("hydra.run.dir", folder.path)], written
@@ -178,9 +191,6 @@ def _continued(name: str, arguments: Sequence[str], trusted: Collection[str]) ->
     typed = [argument for argument in arguments if not argument.startswith("continue=")]
     written = Written("continue", folder, typed, trusted)
     earlier = written.overrides()
-    if choice := (folder.result or {}).get("choice"):
-        chosen = [f"{choice['setting']}={choice['value']}", "choose=null"]
-        earlier = [*(o for o in earlier if _name(o) not in map(_name, chosen)), *chosen]
     options, given = ({_name(o): o.partition("=")[2] for o in some} for some in (earlier, typed))
     own = given.get("hydra.run.dir")
     if own is not None and Path(unquoted(own)).resolve() == folder.path.resolve():

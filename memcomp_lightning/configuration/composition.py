@@ -26,7 +26,7 @@ _OF_MANY_RUNS = ("hydra.", *(f"{name}{mark}" for name in STUDIES for mark in "./
 
 
 Check = Callable[[DictConfig, Sequence[str]], object]
-"""Raises if a configuration may not be built; it gets the overrides as well."""
+"""Raises if a configuration may not be built; it gets the overrides of the curve or method as well."""
 
 _check: ContextVar[Check] = ContextVar("check", default=lambda config, overrides: None)
 
@@ -69,8 +69,9 @@ def composed_for(common: Iterable[str], own: Iterable[str] = ()) -> DictConfig:
     """
     common = tuple(common)
     of_one = tuple(o for o in common if not o.lstrip("+~").startswith(_OF_MANY_RUNS))
-    found = _composed(tuple(search_paths(common)), of_one, tuple(own))
-    _check.get()(found, (*common, *own))
+    own = tuple(own)
+    found = _composed(tuple(search_paths(common)), of_one, own)
+    _check.get()(found, own)
     return found
 
 

@@ -1,6 +1,7 @@
 """A figure of the paper: its curves as trials, a record for each as soon as it exists."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -91,6 +92,8 @@ def parts(config: DictConfig, overrides: Sequence[str]) -> dict[str, tuple[DictC
     if "all" not in config.figure:
         return {".": (config, list(overrides))}
     others = [o for o in overrides if o.lstrip("+").partition("=")[0] not in ("experiment", "figure.all")]
+    for name in config.figure.all:
+        require(re.fullmatch(r"\w+", str(name)) is not None, "figure.all", name, "names of figures")
     own = {name: [f"experiment={name}", *others] for name in config.figure.all}
     return {name: (compose("config", some), some) for name, some in own.items()}
 

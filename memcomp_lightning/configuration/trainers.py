@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.loggers.logger import DummyLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
@@ -17,7 +17,7 @@ from memcomp_lightning.configuration.errors import explain
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.modules.trainers import NOT_WITH_STAGES, check_trainer, tries
-from memcomp_lightning.modules.weights import AtomicCheckpointIO
+from memcomp_lightning.modules.weights import AtomicCheckpointIO, LastCheckpoint
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.studies.plan import Plan, Stage
 
@@ -105,7 +105,7 @@ def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: lis
         # Lightning's own report of these goes to a log that is not shown.
         kind = f"lightning.pytorch.profilers.{settings['profiler'].capitalize()}Profiler"
         settings["profiler"] = {"_target_": kind, "dirpath": str(path.parent), "filename": "profile"}
-    keep_last = ModelCheckpoint(
+    keep_last = LastCheckpoint(
         dirpath=path.parent,
         filename=path.stem,
         every_n_epochs=config.checkpoint_every,

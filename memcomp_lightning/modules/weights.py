@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
@@ -32,6 +33,16 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     ) -> None:
         """Write a checkpoint, or leave the old one."""
         write_tensors(checkpoint, Path(path))
+
+
+class LastCheckpoint(ModelCheckpoint):
+    """Keeps the newest checkpoint, whatever paths the one that it goes on from holds.
+
+    Lightning removes what stands there as the checkpoint before; in a stranger's file that may be anything.
+    """
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take nothing: the next checkpoint takes the place of this one."""
 
 
 def write_tensors(content: Mapping[str, object], path: Path) -> None:

@@ -68,6 +68,9 @@ _WRITING = ("logger", "trainer", "callbacks")
 _OUTPUT = "${hydra:runtime.output_dir}"
 """The run folder, as settings name it."""
 
+_REFERENCE = "${"
+"""Begins what stands for something else, which may be known later alone, or be code."""
+
 
 def check_targets(
     node: Any, name: str, path: Path, trusted: Collection[str] = (), allowed: Allowed = OF_MODELS
@@ -75,7 +78,7 @@ def check_targets(
     """Refuse settings that name other code than what is allowed.
 
     Args:
-        node: Settings, as they stand in a file or resolved.
+        node: Settings, resolved.
         name: Of them.
         path: The run folder.
         trusted: Packages, any part of which may be named.
@@ -99,21 +102,29 @@ def check_targets(
         )
 
 
-def foreign(config: DictConfig, search_path: Collection[str], folder: Path) -> dict[str, str]:
+def resolved(settings: Any, name: str, path: Path) -> Any:
+    """Settings as plain values, with what references stand for.
+
+    Raises:
+        UserError: A text would be a reference again, once it is read anew.
+    """
+    found = OmegaConf.to_container(settings, resolve=True)
+    for where, text in _texts(found, name):
+        if _REFERENCE in text:
+            raise UserError(f"{path}: {where} is {text!r}, which could stand for anything: write what it means.")
+    return found
+
+
+def foreign(config: DictConfig, folder: Path) -> dict[str, str]:
     """What the settings of a training name that is not of this package, each with the setting that names it.
 
     Packages, programs and places: what must be trusted before the training goes on.
 
     Args:
         config: All settings, without Hydra's own.
-        search_path: Where else groups of settings are looked for; packages are imported for it, folders are not.
         folder: Of the run: what writes elsewhere must be trusted as well.
     """
-    found = {}
-    for entry in search_path:
-        if entry.startswith("pkg://"):
-            package = entry.removeprefix("pkg://").partition(".")[0]
-            found[package] = f"{entry}, where settings would be looked for"
+    found: dict[str, str] = {}
     for where, target in _targets(config, ""):
         if not _is_allowed(target, OF_TRAININGS):
             found.setdefault(target.partition(".")[0], f"{where}={target}")
@@ -121,6 +132,13 @@ def foreign(config: DictConfig, search_path: Collection[str], folder: Path) -> d
         if where in _PROGRAMS or (where.startswith(_WRITING) and _leads_out(where, value, folder)):
             found.setdefault(value, f"{where}={value}")
     return found
+
+
+def require_no_links(folder: Path) -> None:
+    """Raise a UserError where a folder holds a link: what is written through it would lie elsewhere."""
+    for path in [folder, *folder.rglob("*")] if folder.is_dir() else ():
+        if path != folder and path.is_symlink():
+            raise UserError(f"{path} is a link, which no run makes: put what it points to in its place.")
 
 
 def forget_lost_initialisers(model: DictConfig) -> None:
@@ -171,6 +189,8 @@ def _texts(node: Any, name: str) -> Iterator[tuple[str, str]]:
 
 def _leads_out(where: str, value: str, folder: Path) -> bool:
     """Whether a text names a place outside of the run folder."""
+    if _REFERENCE in value.removeprefix(_OUTPUT):
+        return True
     if value.startswith(_OUTPUT):
         place = folder / value.removeprefix(_OUTPUT).lstrip("/")
     elif is_path(where):

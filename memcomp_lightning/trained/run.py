@@ -16,7 +16,7 @@ from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.runs.trust import check_targets, forget_lost_initialisers
+from memcomp_lightning.runs.trust import check_targets, forget_lost_initialisers, resolved
 from memcomp_lightning.trained.alone import network_of as network_alone
 from memcomp_lightning.trained.alone import one_of, replica_of, schema_in, taken, tensors_of, warn
 
@@ -193,7 +193,7 @@ def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place:
     schema = schema_of(content)
     for part in ("units", "model", "finetune"):
         # Resolved, and for good: what an interpolation stands for is checked, too.
-        config[part] = OmegaConf.to_container(config[part], resolve=True)
+        config[part] = resolved(config[part], part, path)
         if part == "model":
             forget_lost_initialisers(config.model)
         check_targets(OmegaConf.to_container(config[part]), part, path, trusted)

@@ -1,16 +1,16 @@
 """The rows that a run was trained on, read again from where they lay."""
 
+import inspect
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
-
-from omegaconf import OmegaConf
 
 from memcomp_lightning.configuration.rows import rows_of
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.paths import is_path
-from memcomp_lightning.runs.trust import check_targets
+from memcomp_lightning.runs.trust import check_targets, resolved
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import visible_of
 
@@ -41,9 +41,11 @@ def training_rows(run: Run, *, most: int = 10_000) -> TrainingRows:
     config = folder.settings
     if folder.overrides is None or config is None:
         raise UserError(f"{run.path} lies by itself, and does not say where its data are")
-    source = _from_folder(OmegaConf.to_container(config.data.source, resolve=True), "data.source", folder.typed_in)
+    config.units = resolved(config.units, "units", folder.path)
+    check_targets(config.units, "units", folder.path, run.trusted)
+    source = _from_folder(resolved(config.data.source, "data.source", folder.path), "data.source", folder.typed_in)
     check_targets(source, "data.source", folder.path, run.trusted)
-    if "download" in source:
+    if "download" in inspect.signature(resolve_name(source["_target_"])).parameters:
         source["download"] = False
     config.data.source = source
     try:

@@ -99,7 +99,7 @@ def test_a_replica_is_the_single_run(memcomp_train: Run) -> None:
 @pytest.mark.usefixtures("no_pages")
 @pytest.mark.parametrize("place", ["--config-dir=confs", "hydra.searchpath=['file://confs']"])
 def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, place: str) -> None:
-    """Beside one that has no solver, whose settings are common; it goes on without being told the place again."""
+    """Beside one that has no solver, whose settings are common; it goes on where the place is told again."""
     (tmp_path / "confs/sampler").mkdir(parents=True)
     (tmp_path / "confs/sampler/mine.yaml").write_text("_target_: memcomp_lightning.samplers.CD\nk: 3\n")
     curve = "+figure.curves.mine={label: mine, overrides: ['sampler=mine', 'solver=alternating_descent']}"
@@ -109,7 +109,8 @@ def test_a_sampler_of_ones_own_is_a_curve(memcomp_train: Run, tmp_path: Path, pl
     losses = only(records(), "mine", 2).measures["test_loss"]
     assert losses != only(records(), "cd1", 2).measures["test_loss"]
     Path("run/records.jsonl").unlink()
-    outcome = memcomp_train("resume=run")
+    assert "where settings would be looked for" in memcomp_train("resume=run").err
+    outcome = memcomp_train("resume=run", place)
     assert outcome.status == 0, outcome.err
     assert only(records(), "mine", 2).measures["test_loss"] == losses
 

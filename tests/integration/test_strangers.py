@@ -13,6 +13,8 @@ from running import QUIET, Outcome
 
 import memcomp_lightning
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.files import inside
+from memcomp_lightning.modules.weights import LastCheckpoint
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.trust import OF_TRAININGS, check_targets, foreign
 
@@ -69,6 +71,17 @@ WAYS = {
     ],
     "a program": ["experiment=density", "density.peers=theirs.py"],
     "the Python of a program": ["experiment=density", "+density.peers_python=theirs.py"],
+    "a reference that is known later alone": [
+        "logger=csv",
+        "+logger.csv.prefix='${oc.create:{_target_:theirs.Part}}'",
+    ],
+    "a reference that is written to be read twice": [
+        "+callbacks.pretrain.x={_target_: memcomp_lightning.callbacks.StateWeights,"
+        " alphabet: '\\${oc.create:{_target_:theirs.Part}}'}"
+    ],
+    "a place that a reference leads to": ["logger=csv", "logger.csv.name='${hydra:runtime.cwd}/ran'"],
+    "settings above those of ours": ["experiment=../../../../proc/self/cwd/theirs/sampler/theirs"],
+    "settings elsewhere": ["sampler=/proc/self/cwd/theirs/sampler/theirs"],
 }
 
 
@@ -112,7 +125,7 @@ def test_what_a_run_names_must_be_trusted(memcomp_train: Run, sent: Path) -> Non
         setting = "continue" if number % 3 == 0 and not of_study else "resume"
         outcome = memcomp_train(f"{setting}={sent}")
         assert outcome.status != 0, way
-        told = ("If you trust it, type memcomp-train", "somebody wrote it there")
+        told = ("If you trust it, type memcomp-train", "somebody typed or wrote it")
         assert any(text in outcome.err for text in told), (way, outcome.err)
         assert not any(path.exists() for path in (Path("ran"), Path("../ran"), Path("/ran"))), way
 
@@ -128,6 +141,37 @@ def test_the_line_that_is_told_goes_on(memcomp_train: Run, sent: Path) -> None:
     outcome = memcomp_train(*line)
     assert outcome.status == 0, outcome.err
     assert memcomp_train("resume=own", "trusted=theirs_of_trust").status == 0
+
+
+def test_a_checkpoint_says_nothing_of_what_to_remove(tmp_path: Path) -> None:
+    keeps = LastCheckpoint(dirpath=tmp_path)
+    keeps.load_state_dict({"best_model_path": "local:///somewhere", "dirpath": str(tmp_path)})
+    assert keeps.best_model_path == ""
+
+
+@pytest.mark.parametrize("name", ["weights", "train.log"])
+def test_links_are_refused(memcomp_train: Run, sent: Path, name: str) -> None:
+    (sent / name).rename("elsewhere")
+    (sent / name).symlink_to(Path("elsewhere").absolute())
+    refused = memcomp_train("resume=sent")
+    assert f"sent/{name} is a link, which no run makes" in refused.err
+
+
+def test_texts_that_would_be_references_again(sent: Path) -> None:
+    settings = sent / "settings.yaml"
+    text = settings.read_text()
+    settings.write_text(
+        text.replace("_target_: memcomp_lightning.models.Normal", "x: '\\${oc.create:{_target_:theirs.Part}}'")
+    )
+    with pytest.raises(UserError, match="could stand for anything"):
+        memcomp_lightning.load(sent)
+    assert not Path("ran").exists()
+
+
+def test_a_report_writes_into_its_folder(sent: Path) -> None:
+    with pytest.raises(UserError, match="leads out of this folder"):
+        inside(sent, "../ran")
+    assert inside(sent, "weights") == sent / "weights"
 
 
 def test_what_is_typed_is_trusted(memcomp_train: Run, sent: Path) -> None:
@@ -146,7 +190,7 @@ def test_a_choice_is_no_way_in(memcomp_train: Run, sent: Path) -> None:
     result["choice"] = {"setting": "sampler._target_", "value": "theirs.Part"}
     (sent / "result.json").write_text(json.dumps(result))
     outcome = memcomp_train("continue=sent", "pretrain.iterations=1", "hydra.run.dir=more")
-    assert "sampler=theirs.Part, which is no part of this package" in outcome.err
+    assert "result.json is damaged: its choice is no number" in outcome.err
     assert not Path("ran").exists()
 
 
@@ -164,7 +208,7 @@ def test_every_option_of_ours_may_be_named() -> None:
         config = OmegaConf.load(path)
         if path.parent.name in ("hydra", "launcher", "sweeper", "hparams") or "hydra" in config:
             continue
-        names = foreign(OmegaConf.create({path.parent.name: config}), [], Path("run"))
+        names = foreign(OmegaConf.create({path.parent.name: config}), Path("run"))
         assert not names or path.stem == "dwave_qpu", (path, names)
 
 

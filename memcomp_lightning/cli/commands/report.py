@@ -9,6 +9,7 @@ from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.table import aligned, short_path
+from memcomp_lightning.runs.trust import require_no_links
 from memcomp_lightning.studies.page import page
 from memcomp_lightning.studies.report import write_report
 from memcomp_lightning.studies.verdicts import Verdict
@@ -35,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.error = lambda message: refuse(COMMAND, UserError(f"{message}. {COMMAND} --help shows how."))  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
     try:
+        for folder in given.folders:
+            require_no_links(folder)
         sections = [write_report(folder) for folder in given.folders]
         output = given.output or given.folders[0] / "report.html"
         write_text(output, page(sections))

@@ -104,7 +104,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
 
 def _check_trusted(written: Written, config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job that goes on with a run, if it names nothing that is not trusted."""
-    written.check(config, overrides)
+    written.check(config)
     _check(config, overrides)
 
 
