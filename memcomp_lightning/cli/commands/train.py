@@ -217,7 +217,10 @@ def main() -> None:
 
 
 def _read(arguments: list[str]) -> tuple[CommandLine, Written | None]:
-    arguments, written = with_settings_of_run(arguments)
+    try:
+        arguments, written = with_settings_of_run(arguments)
+    except OSError as error:
+        raise UserError(in_words(error)) from error
     line = read(arguments)
     devices = line.value("trainer.devices")
     if line.multirun and devices not in (None, "1"):
