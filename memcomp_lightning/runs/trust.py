@@ -23,12 +23,10 @@ class Allowed:
         packages: Their classes may be named: making one does no more than hold numbers or read data.
         functions: Functions, and classes of other packages, by their whole names; one that ends with a point
             stands for all that a module defines.
-        called: What all of these are, for messages.
     """
 
     packages: tuple[str, ...]
     functions: tuple[str, ...]
-    called: str
 
 
 _OURS = "memcomp_lightning."
@@ -39,7 +37,6 @@ _EDGES = (f"{_OURS}interop.annealer_graph", f"{_OURS}models.connectivity.")
 OF_MODELS = Allowed(
     packages=(*(f"{_OURS}{name}." for name in _PARTS), "torch.optim."),
     functions=_EDGES,
-    called="part of a model",
 )
 """For those who load a run."""
 
@@ -55,7 +52,6 @@ OF_TRAININGS = Allowed(
         "lightning.pytorch.loggers.TensorBoardLogger",
         "lightning.pytorch.loggers.CSVLogger",
     ),
-    called="part of a training",
 )
 """For those who go on with a run."""
 
@@ -72,23 +68,20 @@ _REFERENCE = "${"
 """Begins what stands for something else, which may be known later alone, or be code."""
 
 
-def check_targets(
-    node: Any, name: str, path: Path, trusted: Collection[str] = (), allowed: Allowed = OF_MODELS
-) -> None:
-    """Refuse settings that name other code than what is allowed.
+def check_targets(node: Any, name: str, path: Path, trusted: Collection[str] = ()) -> None:
+    """Refuse settings that name other code than parts of a model.
 
     Args:
         node: Settings, resolved.
         name: Of them.
         path: The run folder.
         trusted: Packages, any part of which may be named.
-        allowed: What may be named otherwise.
 
     Raises:
         UserError: It says which part it is, and how to trust it.
     """
     for where, target in _targets(node, name):
-        if _is_allowed(target, allowed) or target.startswith(tuple(f"{package}." for package in trusted)):
+        if _is_allowed(target, OF_MODELS) or target.startswith(tuple(f"{package}." for package in trusted)):
             continue
         if _is_lost(target):
             raise UserError(
@@ -97,7 +90,7 @@ def check_targets(
             )
         package = target.partition(".")[0]
         raise UserError(
-            f"{path}: {where} is {target}, which is no {allowed.called} of this package. If you trust it, add "
+            f"{path}: {where} is {target}, which is no part of a model of this package. If you trust it, add "
             f"trusted=[{package}] to the command; in Python type load({str(path)!r}, trusted=[{package!r}])."
         )
 
@@ -136,8 +129,8 @@ def foreign(config: DictConfig, folder: Path) -> dict[str, str]:
 
 def require_no_links(folder: Path) -> None:
     """Raise a UserError where a folder holds a link: what is written through it would lie elsewhere."""
-    for path in [folder, *folder.rglob("*")] if folder.is_dir() else ():
-        if path != folder and path.is_symlink():
+    for path in folder.rglob("*"):
+        if path.is_symlink():
             raise UserError(f"{path} is a link, which no run makes: put what it points to in its place.")
 
 

@@ -16,7 +16,7 @@ from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import inside
 from memcomp_lightning.modules.weights import LastCheckpoint
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.runs.trust import OF_TRAININGS, check_targets, foreign
+from memcomp_lightning.runs.trust import check_targets, foreign
 
 Run = Callable[..., Outcome]
 ONE = [
@@ -214,9 +214,11 @@ def test_every_option_of_ours_may_be_named() -> None:
 
 def test_packages_do_not_stand_for_longer_names(tmp_path: Path) -> None:
     for target in ("torch.optimised.Part", "lightning.pytorch.Trainer.fit", "memcomp_lightning.modelsx.Part"):
-        with pytest.raises(UserError, match=r"no part of a training|which this version"):
-            check_targets({"_target_": target}, "x", tmp_path, allowed=OF_TRAININGS)
-    check_targets({"_target_": "torch.optim.lr_scheduler.StepLR"}, "x", tmp_path, allowed=OF_TRAININGS)
+        with pytest.raises(UserError, match=r"no part of a model|which this version"):
+            check_targets({"_target_": target}, "x", tmp_path)
+        assert foreign(OmegaConf.create({"x": {"_target_": target}}), tmp_path)
+    check_targets({"_target_": "torch.optim.lr_scheduler.StepLR"}, "x", tmp_path)
+    assert not foreign(OmegaConf.create({"x": {"_target_": "torch.optim.lr_scheduler.StepLR"}}), tmp_path)
 
 
 DAMAGED = [
