@@ -1,6 +1,7 @@
-"""Search of settings, one axis after the other, by what held-out rows say; it can be taken up at any point."""
+"""Search of settings, axis by axis in turns, by what held-out rows say; it can be taken up at any point."""
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ Setting = dict[str, Any]
 """A value for each axis."""
 
 Axes = dict[str, list[Any]]
-"""The values of each axis in rising order; axes are searched in the order of the mapping."""
+"""The values of each axis in rising order; a round goes through the axes in the order of the mapping."""
 
 
 def checked_start(axes: Axes, start: Setting, at: str) -> Setting:
@@ -36,7 +37,8 @@ def missing(axes: Axes, start: Setting, judged: Mapping[str, float]) -> list[Set
     """What must be tried next; nothing once the search is over.
 
     On each axis in turn the search walks from where it stands to the neighbour that is better, as long as there is
-    one. It takes the values of an axis for a hill: a second one behind a valley is not found.
+    one, and it goes round the axes until a round moves nothing: more hidden units may want a lower rate. It takes the
+    values of an axis for a hill: a second one behind a valley is not found.
 
     Args:
         axes: See :data:`Axes`.
@@ -59,16 +61,25 @@ def best_of(axes: Axes, start: Setting, judged: Mapping[str, float]) -> Setting:
 
 def _walk(axes: Axes, start: Setting, judged: Mapping[str, float]) -> tuple[Setting, list[Setting]]:
     """Where the search stands, and what it needs to go on."""
-    present = dict(start)
-    for name, values in axes.items():
-        while True:
-            at = values.index(present[name])
-            around = [{**present, name: values[i]} for i in (at - 1, at, at + 1) if 0 <= i < len(values)]
-            unknown = [setting for setting in around if text_of(setting) not in judged]
+    present, before = dict(start), None
+    while present != before:
+        before = present
+        for name, values in axes.items():
+            present, unknown = _climb(name, values, present, judged)
             if unknown:
                 return present, unknown
-            found = max(around, key=lambda setting: judged[text_of(setting)])
-            if not judged[text_of(found)] > judged[text_of(present)]:
-                break
-            present = found
     return present, []
+
+
+def _climb(
+    name: str, values: list[Any], present: Setting, judged: Mapping[str, float]
+) -> tuple[Setting, list[Setting]]:
+    """The top of the hill on one axis, or as far as it is known, and what to try before going on."""
+    while True:
+        at = values.index(present[name])
+        around = [{**present, name: values[i]} for i in (at - 1, at, at + 1) if 0 <= i < len(values)]
+        unknown = [setting for setting in around if text_of(setting) not in judged]
+        found = max(around, key=lambda setting: judged.get(text_of(setting), -math.inf))
+        if unknown or not judged[text_of(found)] > judged[text_of(present)]:
+            return present, unknown
+        present = found

@@ -70,8 +70,19 @@ def test_a_search_walks_uphill_on_each_axis_and_is_taken_up_anywhere() -> None:
         setting = asked[0]  # one at a time: what is asked next depends on what is known alone
         judged[text_of(setting)] = value(setting)
     assert best_of(axes, start, judged) == {"a": 3, "b": 1, "updates": 7}
-    assert len(judged) == 7  # 1, 0, 2, 3 and 4 of a; 1 and 2 of b
+    assert len(judged) == 9  # 1, 0, 2, 3 and 4 of a; 1 and 2 of b; in the second round 2 and 4 of a
     assert missing(axes, start, {}) == [{**start, "a": a} for a in (0, 1, 2)]
+
+
+def test_axes_that_want_each_other_changed_are_climbed_in_rounds() -> None:
+    axes, start = {"rate": [0, 1, 2, 3, 4], "hidden": [0, 1, 2, 3, 4]}, {"rate": 0, "hidden": 0}
+    judged = {
+        text_of({"rate": rate, "hidden": hidden}): -0.4 * (rate - hidden) ** 2 + rate + 2 * hidden
+        for rate in axes["rate"]
+        for hidden in axes["hidden"]
+    }
+    # The first round ends at rate 1 and 3 hidden units: more units pay for a higher rate, which the next round takes.
+    assert best_of(axes, start, judged) == {"rate": 4, "hidden": 4}
 
 
 def test_a_setting_that_diverged_is_not_chosen() -> None:
