@@ -38,7 +38,8 @@ class Solution:
 
     Attributes:
         best: The state of lowest energy: a dict of values by label where the problem has labels, else an array.
-        best_energy: Its energy. Exact for a file, whose ``objective`` may be minus it; of a cut minus its weight.
+        best_energy: Its energy; of a cut minus its weight. Exact for a file, whose ``objective`` may be minus it.
+            Whole numbers whose sums float64 would round are added up as integers of 64 bits.
         energies: Energy of each restart, ``(n_restarts,)``; NaN where not run.
         status: What is known of the best energy, with ``status.advice``: OPTIMAL is proven.
         n_reached: Number of restarts that end at the best energy.

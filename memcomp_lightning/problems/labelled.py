@@ -121,7 +121,8 @@ def _of_sum(kind: Literal["product", "cut", "spin"], labels: list[Any], ends: li
     require(bool(labels), "number of variables", 0, "at least one")
     i, j = np.array(ends, np.int64).reshape(-1, 2).T
     try:
-        values = np.array([*numbers, 0], np.float64)
+        values = np.array([*numbers, 0])
+        values = values if _as_integers(values, _GROWTH[kind]) else values.astype(np.float64)
     except (TypeError, ValueError):
         raise SettingError("The problem's numbers are not all real numbers.") from None
     problem = sum_as_qubo(kind, len(labels), i, j, -values if kind == "cut" else values)
@@ -167,6 +168,22 @@ def _of_matrix(matrix: Any) -> Qubo:
     square = len(shape) == 2 and shape[0] == shape[1] > 0
     require(square, "shape of the problem", shape, "(n, n), one square matrix")
     if tensor:
-        return Qubo.from_matrix(matrix.detach()).floating()
+        matrix = matrix.detach()
+        entries = matrix.to_sparse_coo().coalesce().values() if "sparse" in str(matrix.layout) else matrix
+        whole = not matrix.is_floating_point() and _as_integers(entries.cpu().numpy())
+        return Qubo.from_matrix(matrix.long()) if whole else Qubo.from_matrix(matrix).floating()
     require(matrix.dtype.kind in "biuf", "type of the problem's numbers", str(matrix.dtype), "real numbers")
-    return Qubo.from_matrix(matrix.astype(np.float64))
+    whole = _as_integers(matrix.tocoo().data if hasattr(matrix, "tocoo") else matrix)
+    return Qubo.from_matrix(matrix.astype(np.int64 if whole else np.float64))
+
+
+def _as_integers(values: NDArray[Any], growth: int = 1) -> bool:
+    """Whether these are whole numbers whose sums, with this growth, float64 rounds and int64 holds."""
+    if np.asarray(values).dtype.kind not in "iu":
+        return False
+    size = growth * float(np.abs(np.asarray(values).astype(np.float64)).sum())
+    return 2.0**53 < size < 2.0**62
+
+
+_GROWTH = {"product": 1, "cut": 4, "spin": 9}
+"""What the sizes of the numbers of a QUBO add up to, of a pair's number 1: of spins 4, 2, 2 and 1."""

@@ -19,7 +19,7 @@ class State(NamedTuple):
 
     Attributes:
         values: Its values: within the solvers ``(n,)`` bool.
-        energy: Its energy; exact for a problem from a file.
+        energy: Its energy; exact for a problem from a file or in int64.
         seconds: When it was found, since the search began.
         n_broken: Number of constraints that it breaks.
     """

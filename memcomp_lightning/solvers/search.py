@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning import compiling, rng
-from memcomp_lightning.arrays import alike, as_array, cast, double, to_numpy
+from memcomp_lightning.arrays import alike, as_array, cast, double, is_floating, to_numpy
 from memcomp_lightning.enumeration import binary_states
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.problems.constrained import Constrained
@@ -200,7 +200,7 @@ class _Record:
             trajectory=self._trajectory,
         )
         proven = found.conclusion is Status.OPTIMAL
-        return replace(found, lower_bound=float(found.states[0].energy)) if proven else found
+        return replace(found, lower_bound=_at_most(found.states[0].energy)) if proven else found
 
     def solve(self, solver: QuboSolver, generator: np.random.Generator) -> QuboSolution:
         """A round."""
@@ -217,7 +217,7 @@ class _Record:
         if isinstance(self._problem, Problem):
             energies, broken, status = in_full_of(self._problem, solution)
         else:
-            energies = [energy if math.isfinite(energy) else None for energy in solution.energies.tolist()]
+            energies = self._exact(solution)
             broken = [0] * len(energies) if solution.broken is None else solution.broken.tolist()
             status = [Status(code) for code in solution.status.tolist()]
         self._energies += energies
@@ -231,6 +231,15 @@ class _Record:
         x = to_numpy(solution.assignments) > 0.5
         each = enumerate(zip(energies, broken, strict=True))
         self._offer([(n_broken, energy, x[k]) for k, (energy, n_broken) in each if energy is not None])
+
+    def _exact(self, solution: QuboSolution) -> list[Exact | float | None]:
+        """Energy of each restart, None where not run; of whole numbers that are kept as such without rounding."""
+        energies = solution.energies
+        if not is_floating(self._given.offset):
+            states = cast(alike(solution.assignments, self._given.offset), self._given.offset.dtype)
+            energies = self._given.energy(states)
+        run = np.isfinite(to_numpy(solution.energies)).tolist()
+        return [energy if ran else None for energy, ran in zip(energies.tolist(), run, strict=True)]
 
     def offer(self, x: Bits) -> None:
         """Keep those of these states ``(n_states, n)`` that are low enough, and tell of each better one."""
@@ -313,6 +322,12 @@ class _Record:
 
 _SHORT = (0.25, 0.5, 1)
 """Flips of a variable in short searches: the shorter they are, the more minima they end in."""
+
+
+def _at_most(energy: Exact | float) -> float:
+    """The largest float that is not above it."""
+    rounded = float(energy)
+    return rounded if rounded <= energy else math.nextafter(rounded, -math.inf)
 
 
 def _rank(state: State) -> tuple[int, Exact | float]:

@@ -37,8 +37,8 @@ def missing(axes: Axes, start: Setting, judged: Mapping[str, float]) -> list[Set
     """What must be tried next; nothing once the search is over.
 
     On each axis in turn the search walks from where it stands to the neighbour that is better, as long as there is
-    one, and it goes round the axes until a round moves nothing: more hidden units may want a lower rate. It takes the
-    values of an axis for a hill: a second one behind a valley is not found.
+    one, and it goes round the axes until a round moves nothing: more hidden units may want a lower rate. It takes
+    the values of an axis for a hill: a second one behind a valley is not found.
 
     Args:
         axes: See :data:`Axes`.

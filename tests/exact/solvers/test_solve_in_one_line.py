@@ -363,3 +363,26 @@ def test_constraints_of_another_kind_are_refused():
         Constrained.of(np.eye(2), [])
     with pytest.raises(SettingError, match="constraint = 'x0"):
         Constrained.of(Qubo.from_matrix(np.eye(2)), ["x0 == 1"])
+
+
+@pytest.mark.parametrize("solver", ["best", "annealing", "tabu", "dmm", "brute_force"])
+@pytest.mark.parametrize("write", [np.array, torch.tensor, sp.csr_array, "pairs"])
+def test_whole_numbers_beyond_those_of_float64_are_added_up_as_integers(write, solver):
+    """Found by tests/campaigns/random_problems.py: energies were rounded, and lower bounds lay above them."""
+    rows = [[2**55 + 1, -3, 0], [0, -(2**54) - 7, 2], [0, 0, -1]]
+    entries = {(i, j): q for i, row in enumerate(rows) for j, q in enumerate(row)}
+    found = solve(entries if write == "pairs" else write(rows), solver=solver)
+    assert (type(found.best_energy), found.best_energy) == (int, -(2**54) - 7)
+    assert found.solutions[0].energy == found.best_energy
+    assert found.lower_bound <= found.best_energy
+
+
+def test_spins_and_cuts_of_large_whole_numbers_are_exact_where_int64_holds_them():
+    large = 2**56 + 1
+    found = solve(({"a": 0, "b": 1}, {("a", "b"): large}), solver="brute_force")
+    assert found.best_energy == -large - 1
+    graph = pytest.importorskip("networkx").Graph()
+    graph.add_edge("a", "b", weight=large)
+    assert solve(graph, solver="brute_force").best_energy == -large
+    # Of numbers that int64 does not hold, energies are rounded as those of real numbers are.
+    assert solve({("a", "a"): -(2**70) - 1}).best_energy == -(2.0**70)
