@@ -77,10 +77,10 @@ def network_of(config: DictConfig, shape: Shape) -> nn.Module:
         allowed = "null for data that are no pictures, or data.picture=[HEIGHT, WIDTH]"
         require(bool(own) or "height" not in known, "model.connectivity", connectivity["_target_"], allowed)
         settings["connectivity"] = {**connectivity, **(own or {"n_visible": units.n_sites})}
-    if "hidden" in settings:
-        require_count("model.n_hidden", settings["n_hidden"])
+    of_kind = settings.pop("hidden", None) is not None
+    if of_kind and settings["n_hidden"] is not None:  # null follows from the connectivity
+        require_count("model.n_hidden", settings["n_hidden"], minimum=0)
         arguments["hidden"] = _units(config.model.hidden, "model.hidden", settings.pop("n_hidden"))
-        settings.pop("hidden")
     factory = instantiate(settings, _partial_=True, _convert_="all")
     if "n_classes" in parameters:
         arguments["n_classes"] = shape.n_classes

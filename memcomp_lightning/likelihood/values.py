@@ -4,6 +4,7 @@ from torch import Tensor
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.models.observed import hidden_units_coupled
 
 MOST_HIDDEN = 16
 """Hidden units of a Boltzmann machine that are enumerated for each image at most."""
@@ -26,3 +27,8 @@ def pure_values(model: EnergyModel, v: Tensor, observed: Tensor | None = None) -
 def has_free_energy(model: EnergyModel) -> bool:
     """Whether ``free_energy`` is exact: each hidden unit is coupled to visible ones alone, as in an RBM."""
     return model.quadratic_form().pairs is None
+
+
+def has_row_sums(model: EnergyModel) -> bool:
+    """Whether the sum over the hidden units of a whole row is exact: none of them are coupled, or they are few."""
+    return has_free_energy(model) or not hidden_units_coupled(model) or model.n_hidden <= MOST_HIDDEN

@@ -367,7 +367,7 @@ def _folded(model: BoltzmannMachine) -> RBM:
 
 def _kind_of(visible: Units, hidden: Units, entries: Tensor) -> Units:
     """What some entries of a machine are."""
-    if isinstance(visible, Bernoulli) and isinstance(hidden, Bernoulli):
+    if len(entries) == 0 or (isinstance(visible, Bernoulli) and isinstance(hidden, Bernoulli)):
         return Bernoulli(len(entries))
     seen = entries < visible.n
     return side_by_side(visible.select(entries[seen]), hidden.select(entries[~seen] - visible.n))

@@ -70,5 +70,7 @@ def of_entries(site_pairs: Pairs, site_of: Tensor, n_sites: int) -> Int[Tensor, 
     if len(site_of) == n_sites:
         return site_pairs
     entries = torch.arange(len(site_of), device="cpu").split(torch.bincount(site_of, minlength=n_sites).tolist())
-    found = torch.cat([torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist()])
+    found = torch.cat(
+        [site_pairs[:0], *(torch.cartesian_prod(entries[i], entries[j]) for i, j in site_pairs.tolist())]
+    )
     return found[(found[:, 0] * len(site_of) + found[:, 1]).argsort()]

@@ -35,8 +35,9 @@ def require_whole_sites(units: Units, observed: Tensor) -> None:
     known = units.site_sums(observed.float())
     sizes = units.site_sums(torch.ones(units.n, device=observed.device))
     half = ((known != 0) & (known != sizes)).nonzero()
-    site = half[0].tolist()[-1] if len(half) else 0
-    require(not len(half), f"observed entries of site {site}", "a part", "all entries of a site, or none")
+    row, site = half[0].tolist()[-2:] if len(half) else (0, 0)
+    place = f"observed entries of site {site} in row {row}"
+    require(not len(half), place, "a part", "all entries of a site, or none")
 
 
 def require_known_rows(observed: Tensor, name: str) -> None:

@@ -17,6 +17,7 @@ from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.likelihood import log_likelihood_or_bound, log_pseudo_likelihood
 from memcomp_lightning.likelihood.layers import NUMBERS
 from memcomp_lightning.likelihood.missing import MissingChains, finders, of_observed
+from memcomp_lightning.likelihood.missing.choice import MOST_MISSING_BITS
 from memcomp_lightning.likelihood.values import MOST_HIDDEN
 from memcomp_lightning.models import DBN, EnergyModel
 from memcomp_lightning.models.observed import hidden_units_coupled
@@ -144,6 +145,12 @@ def _likelihoods(
             minus_free[at], error[at] = of_observed(model, v[at], observed[at], generator=rng.stream(seed, "gaps"))
         except SettingError as reason:
             notes.append(f"no likelihoods of rows with gaps: {reason}")
+        else:
+            if n_without := int(minus_free[at].isnan().sum()):
+                notes.append(
+                    f"{n_without:,} rows with gaps have no likelihood: more than {2**MOST_MISSING_BITS:,} "
+                    "combinations of values may be missing, and visible units are coupled to each other"
+                )
     found: dict[str, Tensor] = {}
     if log_z is not None:
         found["log_likelihood"] = minus_free - log_z.value - _log_scale(run, rows)

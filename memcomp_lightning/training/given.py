@@ -19,8 +19,9 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
     """One update's rows as a batch.
 
     Args:
-        given: A batch stays as it is. A tensor ``(*replicas, n, n_visible)``, or a pair of it and of classes, is
-            one step of the optimiser; NaN is a missing value. Numbers of categories, one a site, become entries.
+        given: A batch stays as it is; only its mask is looked at. A tensor ``(*replicas, n, n_visible)``, or a
+            pair of it and of classes, is one step of the optimiser; NaN is a missing value. Numbers of categories,
+            one a site, become entries.
         units: The visible units, for categories and to check the shape; None takes tensors as they are.
 
     Raises:
@@ -31,6 +32,9 @@ def as_batch(given: Given, units: Units | None = None) -> Batch:
     [-1, -1, -1]
     """
     if isinstance(given, Batch):
+        if given.observed is not None and units is not None:
+            require_known_rows(given.observed, "batch")
+            require_whole_sites(units, given.observed)
         return given
     parts: Any = [given] if isinstance(given, Tensor) else given
     tensors = (

@@ -14,7 +14,7 @@ from memcomp_lightning.likelihood.missing.base import ConditionalFinder
 from memcomp_lightning.likelihood.missing.chains import MissingChains
 from memcomp_lightning.likelihood.missing.hidden import HiddenSums
 from memcomp_lightning.likelihood.missing.states import MissingSums, patterns
-from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy
+from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, has_row_sums
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.machine import log2_states
 from memcomp_lightning.models.observed import visible_units_coupled
@@ -46,7 +46,7 @@ def finders(
     """How the missing values of each row are found; rows without any are left out.
 
     The hidden states are summed where they are at most 2^12, the states of what is missing where these are at most
-    2^10 and the model is an RBM; the rest is left to chains.
+    2^10 and hidden units have exact sums; the rest is left to chains.
 
     Args:
         model: Without replica axes.
@@ -55,7 +55,7 @@ def finders(
     """
     gaps = ~observed.all(-1)
     summed = _sums_hidden(model, MOST_HIDDEN_BITS)
-    few = (missing_bits(model, observed) <= MOST_MISSING_BITS) & has_free_energy(model)
+    few = (missing_bits(model, observed) <= MOST_MISSING_BITS) & has_row_sums(model)
     ways: list[tuple[ConditionalFinder, Tensor]] = [
         (HiddenSums(), gaps & summed),
         (MissingSums(), gaps & few & (not summed)),
@@ -74,6 +74,8 @@ def of_observed(
 ) -> ObservedEstimate:
     """Log of the sum of exp(-E) over hidden units and missing values: exact where it can be, else annealed.
 
+    Annealing is for RBMs; in another machine rows of which more than 2^10 states are missing get NaN.
+
     Args:
         model: Without replica axes.
         v: Values of the visible units.
@@ -82,21 +84,22 @@ def of_observed(
         annealing: Its settings.
 
     Raises:
-        SettingError: A machine that is no RBM and has many hidden units, or couplings between visible ones.
+        SettingError: A machine with many hidden units that are coupled to each other.
     """
     if _sums_hidden(model, MOST_HIDDEN):
         log_weight = log_likelihood(model, v, v.new_zeros((), dtype=torch.float64), observed=observed)
         return ObservedEstimate(log_weight, torch.zeros_like(log_weight))
-    allowed = f"an RBM, or a machine of at most {MOST_HIDDEN} hidden units, for rows with missing values"
-    require(has_free_energy(model), "model", type(model).__name__, allowed)
+    allowed = f"none, or at most {MOST_HIDDEN} hidden units, for rows with missing values"
+    require(has_row_sums(model), "couplings between hidden units", True, allowed)
     few = missing_bits(model, observed) <= MOST_MISSING_BITS
-    log_weight, error = torch.zeros(2, len(v), dtype=torch.float64, device=v.device)
+    log_weight, error = torch.full((2, len(v)), torch.nan, dtype=torch.float64, device=v.device)
     at = few.nonzero().flatten()
     if len(at):
         for pattern in patterns(model, v[at], observed[at]):
             log_weight[at[pattern.rows]] = pattern.log_weight.logsumexp(-1)
+        error[at] = 0.0
     at = (~few).nonzero().flatten()
-    if len(at):
+    if len(at) and has_free_energy(model):
         found = (annealing or ObservedAis()).estimate(cast(RBM, model), v[at], observed[at], generator=generator)
         log_weight[at], error[at] = found
     return ObservedEstimate(log_weight, error)

@@ -8,10 +8,10 @@ import torch
 from torch import Generator, Tensor
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.likelihood.boltzmann import double_of
+from memcomp_lightning.likelihood.boltzmann import double_of, log_hidden_sum
 from memcomp_lightning.likelihood.layers import NUMBERS
 from memcomp_lightning.likelihood.missing.base import Conditional, drawn, real_entries
-from memcomp_lightning.likelihood.values import has_free_energy
+from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import all_states
@@ -35,7 +35,7 @@ class Pattern(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MissingSums:
-    r"""Exact sums over the values that are missing, by the free energies of an RBM: of discrete units, and few.
+    r"""Exact sums over values that are missing, discrete ones and few, where hidden units are summed exactly.
 
     .. math:: p(missing | observed) \propto \exp(-F(missing, observed))
     """
@@ -51,7 +51,7 @@ class MissingSums:
         """What is known of the missing values, without any error of sampling.
 
         Raises:
-            SettingError: A real value is missing; the model has no free energy in closed form.
+            SettingError: A real value is missing; hidden units of a machine are coupled, and too many.
         """
         mean, draws = v.double().clone(), v.double().repeat(m, 1, 1)
         for rows, at, states, log_weight in patterns(model, v, observed):
@@ -65,21 +65,31 @@ class MissingSums:
 @torch.no_grad()
 def patterns(model: EnergyModel, v: Tensor, observed: Tensor) -> Iterator[Pattern]:
     """Weights of all that the missing values may be, in float64; rows without gaps have one, empty state."""
-    require(
-        has_free_energy(model), "model", type(model).__name__, "an RBM, which has a free energy in closed form"
-    )
-    rbm, v = cast(RBM, double_of(model)), v.double()
+    wide, v = double_of(model), v.double()
+    log_weights = _of_rbm if has_free_energy(model) else _of_whole_rows
     known = torch.where(observed, v, 0.0)
-    of_known = known @ rbm.b if rbm.visible.linear else known @ rbm.b - rbm.visible.energy(known)
     masks, kinds = torch.unique(observed, dim=0, return_inverse=True)
     for k, mask in enumerate(masks):
         at = (~mask).nonzero().flatten()
-        kind = rbm.visible.select(at)
+        kind = wide.visible.select(at)
         require(not kind.real or not len(at), "units that are missing", "real", "discrete ones")
         states = all_states(kind, v) if len(at) else v.new_zeros(1, 0)
-        shift, bias = states @ rbm.weight[:, at].T, states @ rbm.b[at]
-        together = max(1, NUMBERS // (len(states) * rbm.n_hidden))
+        together = max(1, NUMBERS // (len(states) * wide.n_units))
         for rows in (kinds == k).nonzero().flatten().split(together):
-            field = rbm.hidden_field(known[rows]).unsqueeze(-2) + shift
-            log_weight = rbm.hidden.cumulant(field).sum(-1) + bias + of_known[rows].unsqueeze(-1)
-            yield Pattern(rows, at, states, log_weight)
+            yield Pattern(rows, at, states, log_weights(wide, known[rows], at, states))
+
+
+def _of_rbm(model: EnergyModel, known: Tensor, at: Tensor, states: Tensor) -> Tensor:
+    """Minus the free energy of each row in each state, ``(n, n_states)``, from one field a row and one a state."""
+    rbm = cast(RBM, model)
+    of_known = known @ rbm.b if rbm.visible.linear else known @ rbm.b - rbm.visible.energy(known)
+    field = rbm.hidden_field(known).unsqueeze(-2) + states @ rbm.weight[:, at].T
+    return rbm.hidden.cumulant(field).sum(-1) + states @ rbm.b[at] + of_known.unsqueeze(-1)
+
+
+def _of_whole_rows(model: EnergyModel, known: Tensor, at: Tensor, states: Tensor) -> Tensor:
+    """The same of any machine, whose rows are written out whole."""
+    whole = known.unsqueeze(-2).repeat(1, len(states), 1)
+    whole[..., at] = states
+    of_rows: Tensor = log_hidden_sum(model, whole.flatten(0, 1), max_units=MOST_HIDDEN)
+    return of_rows.unflatten(0, whole.shape[:2])

@@ -115,7 +115,7 @@ class Units(nn.Module):
 
     def total_energy(self, x: Values, weight: Float[Tensor, "*axes"]) -> Float[Tensor, "*replicas"]:
         """Weighted sum of ``energy`` over the rows of x, ``(*replicas, n_rows, n)``, constants to autograd."""
-        return (weight * self.energy(x)).sum(-1)
+        return (weight.detach() * self.energy(x.detach())).sum(-1)
 
     @property
     def curvature(self) -> Tensor | None:
@@ -200,7 +200,8 @@ class Units(nn.Module):
 
     def bits(self) -> Bits:
         """How the layer is written in bits for a QUBO; entries with a curvature may be left out."""
-        raise self._without("a form in bits, as QUBOs and pseudo-likelihoods need it")
+        remedy = "Samplers that need none: cd, pcd, parallel_tempering, block_annealing."
+        raise self._without("a form in bits, as QUBOs and pseudo-likelihoods need it", remedy)
 
     # -------------------------------------------------------------------------------------------- entries
 
@@ -254,8 +255,9 @@ class Units(nn.Module):
                     setattr(module, name, _with_axes(buffer, replicas))
         return made
 
-    def _without(self, what: str) -> SettingError:
-        return SettingError(f"units = {type(self).__name__!r} is not allowed: expected units with {what}.")
+    def _without(self, what: str, remedy: str = "") -> SettingError:
+        message = f"units = {type(self).__name__!r} is not allowed: expected units with {what}. {remedy}"
+        return SettingError(message.rstrip())
 
 
 def require_values(

@@ -3,8 +3,11 @@
 import math
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from memcomp_lightning import rng
@@ -32,10 +35,12 @@ class Categorical(Units):
     [[0.0, 1.0, 1.0, 0.0, 0.0]]
     """
 
-    def __init__(self, n_sites: int | Sequence[int] | Tensor, q: int | None = None) -> None:
-        if isinstance(n_sites, Sequence | Tensor):
+    def __init__(
+        self, n_sites: int | Sequence[int] | Tensor | NDArray[np.integer[Any]], q: int | None = None
+    ) -> None:
+        if isinstance(n_sites, Sequence | Tensor | np.ndarray):
             require(q is None, "q", q, "None where the number of states of each site is given")
-            given = n_sites.tolist() if isinstance(n_sites, Tensor) else n_sites
+            given = n_sites if isinstance(n_sites, Sequence) else n_sites.tolist()
             for site, size in enumerate(given):
                 require_count(f"number of states of site {site}", size)
             sizes = [int(size) for size in given]

@@ -43,9 +43,8 @@ class Gaussian(Units):
 
     def __init__(self, n: int, *, variance: float | Tensor = 1.0, learned: bool = True) -> None:
         super().__init__(n)
-        require(
-            isinstance(variance, Real | Tensor), "variance", variance, f"a number > 0, or a tensor of {n} numbers"
-        )
+        number = isinstance(variance, Real | Tensor) and not isinstance(variance, bool)
+        require(number, "variance", variance, f"a number > 0, or a tensor of {n} numbers")
         given = torch.as_tensor(variance, dtype=torch.float32, device="cpu")
         require(given.shape in ((), (n,)), "shape of variance", tuple(given.shape), f"() or ({n},)")
         wrong = ~_usable(given).expand(n)

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
-from memcomp_lightning.errors import SettingError
 from memcomp_lightning.likelihood.missing import (
     Conditional,
     HiddenSums,
@@ -21,6 +20,7 @@ from memcomp_lightning.likelihood.missing.base import SHARES, real_entries
 from memcomp_lightning.likelihood.missing.choice import missing_bits
 from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
+from memcomp_lightning.models import BoltzmannMachine
 from memcomp_lightning.models.observed import visible_units_coupled
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin
 from memcomp_lightning.testing import brute_force, enumerated, small_machines, small_rbm, small_rbms
@@ -187,21 +187,41 @@ def test_each_row_is_found_by_the_shortest_way() -> None:
 @pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
 def test_observed_values_are_as_likely_as_sums_say(make: Any) -> None:
     model = make().double()
-    if visible_units_coupled(model):
-        with pytest.raises(SettingError, match="an RBM, or a machine of at most 16 hidden units"):
-            of_observed(model, *rows_of(model), generator=rng.stream(0, "gaps"))
-        return
     v, observed = rows_of(model)
     log_z = brute_force.log_sum(model)
     exact = brute_force.log_likelihood(model, v, observed) + log_z
+    if visible_units_coupled(model):
+        found = of_observed(model, v, observed, generator=rng.stream(0, "gaps"))
+        few = missing_bits(model, observed) <= 10
+        assert found.log_weight[few].allclose(exact[few], atol=1e-9)
+        assert bool(found.log_weight[~few].isnan().all())
+        return
     ais = ObservedAis(n_chains=200, n_betas=20)
     if not model.hidden.real or not model.visible.real:
         found = of_observed(model, v, observed, generator=rng.stream(0, "gaps"), annealing=ais)
         assert bool(((found.log_weight - exact).abs() <= 1e-6 + 4 * found.standard_error).all())
-    if has_free_energy(model):
+    if not model.hidden.real or has_free_energy(model):
         few = (missing_bits(model, observed) < 20).nonzero().flatten()
         for rows, _, _, log_weight in patterns(model, v[few], observed[few]):
             assert log_weight.logsumexp(-1).allclose(exact[few][rows], atol=1e-6)
+    if has_free_energy(model):
         annealed = ais.estimate(model, v, observed, generator=rng.stream(0, "ais"))
         assert bool(((annealed.log_weight - exact).abs() <= 1e-6 + 4 * annealed.standard_error).all())
         assert bool((annealed.standard_error < 0.1).all())
+
+
+def test_a_potts_model_tells_rows_with_few_gaps_and_has_no_number_for_those_with_many() -> None:
+    machine = BoltzmannMachine(visible=Categorical(4, q=8), n_hidden=0).double()
+    with torch.no_grad():
+        machine.coupling.normal_(0, 0.5, generator=rng.stream(0, "couplings"))
+    v = machine.visible.encode(torch.tensor([[0.0, 3, 7, 1], [2.0, 2, 2, 2], [1.0, 5, 0, 6]]).double())
+    known = torch.tensor([[True, True, True, False], [True, False, False, False], [False, True, False, False]])
+    known[2, 0] = True
+    observed = machine.visible.over_sites(known)  # 3, 9 and 6 bits are missing
+    found = of_observed(machine, v, observed, generator=rng.stream(0, "gaps"))
+    exact = brute_force.log_likelihood(machine, v, observed) + brute_force.log_sum(machine)
+    torch.testing.assert_close(found.log_weight, exact.detach())
+    assert [type(way) for way, _ in finders(machine, observed)] == [MissingSums]
+    observed[1] = False  # 12 bits
+    found = of_observed(machine, v, observed, generator=rng.stream(0, "gaps"))
+    assert found.log_weight.isnan().tolist() == [False, True, False]

@@ -8,15 +8,18 @@ import torch
 
 from memcomp_lightning import rng
 from memcomp_lightning.errors import SettingError
+from memcomp_lightning.likelihood import log_partition_function
 from memcomp_lightning.likelihood.both_ways import estimate_both_ways
-from memcomp_lightning.models import RBM, start_at_means
+from memcomp_lightning.models import RBM, BoltzmannMachine, start_at_means
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.init import independent_bias
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, ReLU, Spin
+from memcomp_lightning.objective import contrast
 from memcomp_lightning.samplers import CD, BlockAnnealing
+from memcomp_lightning.testing import brute_force
 from memcomp_lightning.training import Greedy, pretrain
 from memcomp_lightning.training.given import as_batch
-from memcomp_lightning.types import Configurations
+from memcomp_lightning.types import Batch, Configurations
 
 NAN = float("nan")
 
@@ -60,7 +63,7 @@ def trained_on(rbm: EnergyModel, v: torch.Tensor) -> None:
         (
             RBM(visible=Categorical(2, 3), n_hidden=2),
             [[1, NAN, 0, 0, 0, 1], [0, 1, 0, 0, 1, 0]],
-            "observed entries of site 0 = 'a part' is not allowed",
+            "observed entries of site 0 in row 0 = 'a part' is not allowed",
         ),
         (RBM(visible=Spin(2), n_hidden=2), [[NAN, NAN], [NAN, NAN]], "batch, values known in row 0 = 0"),
         (RBM(visible=Spin(2), n_hidden=2), [[1, -1], [NAN, NAN]], "batch, values known in row 1 = 0"),
@@ -106,3 +109,44 @@ def test_the_energy_of_a_ground_state_of_rectified_units_is_that_of_the_state():
     state = sampler.init(model, 1, generator=generator)
     found = sampler.sample(model, state, nothing, generator=generator)
     assert float(found.info["ground_state_energy"]) == pytest.approx(lowest, abs=1e-5)
+
+
+def test_masks_of_batches_are_looked_at_before_they_train() -> None:
+    model = RBM(visible=Categorical([3, 2]), hidden=Spin(2))
+    v = model.visible.encode(torch.tensor([[0.0, 1.0], [2.0, 0.0]]))
+    label = torch.zeros(2, dtype=torch.long)
+    half, none = torch.ones(2, 2, 5, dtype=torch.bool)
+    half[1, 3] = none[1] = False
+    for observed, message in (
+        (half, r"observed entries of site 1 in row 1 = 'a part'"),
+        (none, r"batch, values known in row 1 = 0"),
+    ):
+        with pytest.raises(SettingError, match=message):
+            as_batch(Batch(v, label, 1.0, True, observed=observed), model.visible)
+
+
+def test_one_site_of_several_states_is_a_model_of_its_own() -> None:
+    """Its biases alone: without other sites there are no pairs."""
+    for visible in (Categorical(1, q=3), Gaussian(1, variance=0.5), Spin(1)):
+        model = BoltzmannMachine(visible=visible, n_hidden=0).double()
+        with torch.no_grad():
+            model.b.uniform_(-1, 1, generator=rng.stream(0, "biases"))
+        torch.testing.assert_close(log_partition_function(model), brute_force.log_sum(model).detach())
+
+
+def test_energies_of_rectified_units_are_constants_where_their_states_carry_a_graph() -> None:
+    model = RBM(visible=Spin(2), hidden=ReLU(2)).double()
+    v = torch.tensor([[1.0, -1.0], [1.0, 1.0]]).double()
+    gradients = []
+    for detached in (False, True):
+        h = model.hidden.points(model.hidden_field(v))[0]
+        h = h.detach() if detached else h
+        loss = contrast(model, Configurations(v, h), Configurations(-v, h.flip(0)))
+        gradients.append(torch.autograd.grad(loss.sum(), [model.c, model.weight]))
+    torch.testing.assert_close(*gradients)
+
+
+def test_sizes_are_taken_from_arrays_and_a_variance_is_no_switch() -> None:
+    assert Categorical(np.array([2, 3])).sizes == (2, 3)
+    with pytest.raises(SettingError, match="variance = True is not allowed: expected a number > 0"):
+        Gaussian(2, variance=True)

@@ -234,7 +234,7 @@ def test_masks_that_hide_everything_or_half_a_site_are_refused():
         ),
         ((slice(None), 0), r"observed values in column 0 = 0 .*Leave out the column"),
         ((slice(None), slice(None)), r"observed values in row 0 = 0"),
-        ((2, 4), r"observed entries of site 2 = 'a part' .*all entries of a site, or none"),
+        ((2, 4), r"observed entries of site 2 in row 2 = 'a part' .*all entries of a site, or none"),
     ):
         wrong = mask.clone()
         wrong[change] = False

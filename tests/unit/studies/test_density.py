@@ -81,7 +81,7 @@ def test_axes_that_want_each_other_changed_are_climbed_in_rounds() -> None:
         for rate in axes["rate"]
         for hidden in axes["hidden"]
     }
-    # The first round ends at rate 1 and 3 hidden units: more units pay for a higher rate, which the next round takes.
+    # The first round ends at rate 1 and 3 hidden units: more of them pay for a higher rate, which the next takes.
     assert best_of(axes, start, judged) == {"rate": 4, "hidden": 4}
 
 
