@@ -166,6 +166,10 @@ class RunFolder:
     def finish_stage(self, stage: str, record: Mapping[str, object]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
         write_json(self.path / "stages.json", {**self.finished_stages, stage: record})
+        self.forget_checkpoint(stage)
+
+    def forget_checkpoint(self, stage: str) -> None:
+        """Remove the checkpoint of a stage that is done; a kill may have come between the two."""
         self.checkpoint(stage).unlink(missing_ok=True)
 
     def finish(self, result: Mapping[str, object]) -> None:

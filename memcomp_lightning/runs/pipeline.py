@@ -74,6 +74,7 @@ def run(
         if name in done and folder.weights(name).exists():
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
+            folder.forget_checkpoint(name)
         else:
             with _threads_for(stage):
                 trainer = _fit(stage, make_trainer(stage), folder)
