@@ -35,14 +35,27 @@ def written_whole(path: Path) -> Iterator[Path]:
     _tidy(path.parent)
     partial, waiting = path.with_name(f".{path.name}.{_MACHINE}.{os.getpid()}.partial"), _waiting.get()
     try:
-        yield partial
-        if waiting is None:
-            partial.replace(path)
-        else:
-            waiting[path] = partial
+        with naming(path):
+            yield partial
+            if waiting is None:
+                partial.replace(path)
+            else:
+                waiting[path] = partial
     finally:
         if waiting is None or path not in waiting:
-            partial.unlink(missing_ok=True)
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an error of the system name the file that it is about; that of a full disk names none."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None:
+            error.filename, error.filename2 = str(path), None
+        raise
 
 
 def _tidy(folder: Path) -> None:
@@ -78,7 +91,8 @@ def written_together() -> Iterator[None]:
     try:
         yield
         for path, partial in waiting.items():
-            partial.replace(path)
+            with naming(path):
+                partial.replace(path)
     finally:
         _waiting.reset(before)
         for partial in waiting.values():

@@ -218,7 +218,7 @@ class StageModule(pl.LightningModule):
 
     @property
     def _nothing_was_left(self) -> bool:
-        """Whether a resumed training was found to be at its end: training starts and ends are then not announced."""
+        """Whether a resumed training was at its end already: neither its start nor its end is then announced."""
         return self._loaded is not None
 
     def _take_back(self) -> None:

@@ -159,7 +159,7 @@ def main() -> None:
             folders=("solve", "solve"),
         )
         sys.argv[1:] = line.arguments
-        with answering(line):
+        with answering(line, COMMAND):
             solve()
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
