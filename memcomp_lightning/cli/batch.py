@@ -145,7 +145,8 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
         if not isinstance(error, OSError):
             raise
         place = f"{error.filename or table} cannot be written ({error.strerror})"
-        raise UserError(f"{place}: choose another file with --output FILE.") from error
+        rest = f"choose another file with --output FILE. Finished rows are kept. Go on with: {again}"
+        raise UserError(f"{place}: {rest}") from error
     own = [rows[key] for key in label]
     return 1 if any(row["error"] for row in own) else 0 if all(map(solve_table.is_answer, own)) else NOT_FEASIBLE
 

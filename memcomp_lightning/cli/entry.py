@@ -28,9 +28,10 @@ LOST_OUTPUT = 1
 def run(command: str, *arguments: object) -> None:
     """Run ``memcomp-NAME``: the ``main`` of ``memcomp_lightning.cli.commands.NAME``."""
     before = _end_at_once(command)
+    stop = _Stop(before)
     atexit.register(gc.freeze)  # a last look for garbage would take a fifth of a short run
     try:
-        _run(command, arguments, _Stop(before))
+        _run(command, arguments, stop)
     except Exception as error:  # also while modules are imported
         from memcomp_lightning.errors import lost
 
@@ -39,8 +40,9 @@ def run(command: str, *arguments: object) -> None:
         _write_line(f"{command}: {said} Go on with: {_typed(command)}")
         sys.exit(FAILED)
     finally:
-        for number, handler in before.items():
-            _answer(number, handler)
+        atexit.register(stop.ignore)
+        if not stop.heard:
+            stop.forget()
 
 
 def _typed(command: str) -> str:
@@ -65,7 +67,8 @@ def _run(command: str, arguments: tuple[object, ...], stop: "_Stop") -> None:
             main(*arguments)
         except KeyboardInterrupt as interrupt:
             stop.ignore()
-            say(f"\n{command}: {_SIGNALS[stop.number]}. {interrupt}".rstrip(), error=True)
+            rest = str(interrupt) or f"Go on with: {_typed(command)}"
+            say(f"\n{command}: {_SIGNALS[stop.number]}. {rest}", error=True)
             sys.exit(128 + stop.number)
         finally:
             sys.stdout.flush()
@@ -94,16 +97,23 @@ class _Stop:
 
     Attributes:
         number: The signal that came last.
+        heard: Whether one came.
     """
 
     def __init__(self, before: dict[signal.Signals, object]) -> None:
         self.number = signal.SIGINT
+        self.heard = False
         self._before, self._at = before, -PATIENCE_S
 
     def listen(self) -> None:
         """Answer the signals from here on."""
         for number in self._before:
             _answer(number, self)
+
+    def forget(self) -> None:
+        """Let the signals do what they did before."""
+        for number, handler in self._before.items():
+            _answer(number, handler)
 
     def ignore(self) -> None:
         """The command has ended, and says so."""
@@ -113,7 +123,7 @@ class _Stop:
     def __call__(self, number: int, frame: object) -> None:
         now = time.monotonic()
         if now - self._at >= PATIENCE_S:
-            self._at, self.number = now, signal.Signals(number)
+            self._at, self.number, self.heard = now, signal.Signals(number), True
             raise KeyboardInterrupt
 
 

@@ -145,6 +145,7 @@ def carry_out(
 ) -> None:
     """Read the command line, and act; what the user can put right ends it by one line, with no file written."""
     typed = sys.argv[1:] if arguments is None else list(arguments)
+    again = shlex.join([usage.command, *typed])
     if {"--help", "-h"} & set(typed):
         say(usage.help)
         return
@@ -157,12 +158,10 @@ def carry_out(
             )
             act(places, settings)
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(
-            f"No file was written. Go on with: {shlex.join([usage.command, *typed])}"
-        ) from stop
+        raise KeyboardInterrupt(f"No file was written. Go on with: {again}") from stop
     except OSError as error:
         said = lost(error)
-        rest = f" No file was written. Go on with: {shlex.join([usage.command, *typed])}"
+        rest = f" No file was written. Go on with: {again}"
         refuse(usage.command, UserError(in_words(error) if said is None else said + rest))
     except (UserError, SettingError, CheckpointError) as error:
         refuse(usage.command, UserError(in_words(error)))

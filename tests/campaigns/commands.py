@@ -43,6 +43,7 @@ with suppress(PermissionError):
     os.setsid()
 last = int(os.environ.pop("KILLED_AT_WRITE", "0"))
 told = os.environ.pop("WRITES_TOLD_IN", "")
+ready = os.environ.pop("READY_TOLD_IN", "")
 writes = 0
 
 def count(event, arguments):
@@ -68,6 +69,8 @@ for code in filter(None, [os.environ.pop("BEFORE_THE_COMMAND", "")]):
     exec(code)
 module = importlib.import_module(f"memcomp_lightning.cli.{sys.argv[1]}")
 sys.argv[:2] = [f"memcomp-{sys.argv[1]}"]
+if ready:
+    os.close(os.open(ready, os.O_CREAT | os.O_WRONLY))
 module.main()
 """
 """What stands before a command: a process group of its own, and a count of its writes, at one of which it dies."""
@@ -267,13 +270,18 @@ def live(
     at_write: int = 0,
     count_writes: bool = False,
     cold: bool = False,
-    meanwhile: Callable[[Any], None] | None = None,
+    meanwhile: Callable[[Any], object] | None = None,
     **environment: str,
 ) -> Ended:
-    """Run a command to its end, which may be that of a signal to its process group after some seconds."""
-    told = folder.parent / f".{folder.name}.writes"
+    """Run a command to its end, which may be that of a signal to its process group after some seconds.
+
+    ``meanwhile`` is called with the program once its command has begun.
+    """
+    told, ready = (folder.parent / f".{folder.name}.{what}" for what in ("writes", "ready"))
+    ready.unlink(missing_ok=True)
     own = {**environment, **({"KILLED_AT_WRITE": str(at_write)} if at_write else {})}
     own |= {"WRITES_TOLD_IN": str(told)} if count_writes else {}
+    own |= {} if meanwhile is None else {"READY_TOLD_IN": str(ready)}
     begin = time.monotonic()
     program: Any
     if cold:
@@ -291,6 +299,9 @@ def live(
     for timer in timers:
         timer.start()
     if meanwhile is not None:
+        until = time.monotonic() + GIVEN_UP_AFTER
+        while not ready.exists() and time.monotonic() < until:
+            time.sleep(0.002)
         meanwhile(program)
     try:
         out, err = program.communicate(timeout=GIVEN_UP_AFTER)

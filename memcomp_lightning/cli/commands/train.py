@@ -230,6 +230,8 @@ def _end_of_sweep() -> None:
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
         say(f"\n{table}\n{closing_lines(short_path(folder))}")
+        if n_failed:
+            say(f"Go on with: {shlex.join([COMMAND, *sys.argv[1:]])}")
         sys.exit(1 if n_failed else 0)
 
 
@@ -252,6 +254,7 @@ def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="The `srun` command is available")  # on each node of Slurm
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 
