@@ -46,8 +46,11 @@ class LastCheckpoint(ModelCheckpoint):
 
 
 def write_tensors(content: Mapping[str, object], path: Path) -> None:
-    """Write a file for :func:`torch.load`, whole or not at all, and its folder if there is none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a file for :func:`torch.load`, whole or not at all, and its folder if there is none.
+
+    What that lies in is there: a run folder that has vanished is not made anew.
+    """
+    path.parent.mkdir(exist_ok=True)
     with written_whole(path) as partial, partial.open("wb") as file:
         save_tensors(content, file)
 

@@ -165,6 +165,7 @@ class RunFolder:
 
     def finish_stage(self, stage: str, record: Mapping[str, object]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
+        self._require_there()
         write_json(self.path / "stages.json", {**self.finished_stages, stage: record})
         self.forget_checkpoint(stage)
 
@@ -174,9 +175,19 @@ class RunFolder:
 
     def finish(self, result: Mapping[str, object]) -> None:
         """Write the result, with what produced it."""
+        self._require_there()
         origin = {"memcomp_lightning": __version__, **_machine()}
         write_json(self.path / "result.json", {**result, "origin": origin})
         self.forget_error()
+
+    def begin(self, stages: Sequence[str]) -> None:
+        """Make the folders of the stages' checkpoints."""
+        for stage in stages:
+            self.checkpoint(stage).parent.mkdir(parents=True, exist_ok=True)
+
+    def _require_there(self) -> None:
+        """Raise an OSError if the folder has vanished, though somebody may have made another in its place."""
+        (self.path / "settings.yaml").stat()
 
     def fail(self, record: Mapping[str, object]) -> None:
         """Write why the run failed."""

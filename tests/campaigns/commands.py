@@ -26,7 +26,7 @@ import torch
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "tests/integration"))
 
-import running
+import running  # noqa: E402
 
 # What is tried is the package of this tree.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
@@ -118,9 +118,7 @@ class Kind:
 
 _TINY = ("callbacks=minimal", "logger=none", "checkpoint_every=1", "hydra.run.dir=run")
 _BARS = (*_TINY, "data=shifting_bars", "data.source.copies=3", "sampler=pcd", "sampler.n_chains=7")
-_SWEPT = tuple(o for o in _BARS[:-2] if "hydra" not in o) + (
-    *("model.hidden_sizes=[5,4]", "pretrain.iterations=4", "finetune.iterations=3"),
-)
+_SWEPT = (*tuple(o for o in _BARS[:-2] if "hydra" not in o), *("model.hidden_sizes=[5,4]", "pretrain.iterations=4", "finetune.iterations=3"))
 _TWO = ("model.hidden_sizes=[5,4]", "pretrain.iterations=8", "finetune.iterations=6")
 _PEOPLE = "id,age,sex,colour,species\n" + "".join(
     f"{i},{20 + 7 * (i % 5) + i % 3},{'fm'[i % 2]},{['red', 'green', '', 'blue'][i % 4]},{['cat', 'dog'][i % 2]}\n"
@@ -175,8 +173,7 @@ KINDS = {
         Kind(
             "machine",
             "train",
-            (*_BARS, "model=boltzmann", "model.n_hidden=3", "pretrain=boltzmann", "finetune.iterations=0")
-            + ("pretrain.iterations=12",),
+            (*_BARS, "model=boltzmann", "model.n_hidden=3", "pretrain=boltzmann", "finetune.iterations=0", "pretrain.iterations=12"),
             resumes=True,
         ),
         _GAPS,
@@ -196,8 +193,7 @@ KINDS = {
         Kind(
             "mode-assisted",
             "train",
-            (*_BARS[:6], *_TWO, "sampler=mode_assisted_pcd", "sampler.inner.n_chains=11")
-            + ("sampler.schedule.p_max=0.5", "solver.n_restarts=3"),
+            (*_BARS[:6], *_TWO, "sampler=mode_assisted_pcd", "sampler.inner.n_chains=11", "sampler.schedule.p_max=0.5", "solver.n_restarts=3"),
             resumes=True,
         ),
         Kind("figure", "train", (*_FIGURE, "figure.workers=1"), resumes=True, weight=3),
@@ -207,29 +203,26 @@ KINDS = {
         Kind(
             "sweep",
             "train",
-            ("-m", "sampler=cd,pcd", *_SWEPT) + ("hydra.sweep.dir=run",),
+            ("-m", "sampler=cd,pcd", *_SWEPT, "hydra.sweep.dir=run"),
             weight=3,
         ),
         Kind(
             "sweep by joblib",
             "train",
-            ("-m", "sampler=cd,pcd", *_SWEPT)
-            + ("hydra.sweep.dir=run", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+            ("-m", "sampler=cd,pcd", *_SWEPT, "hydra.sweep.dir=run", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
             weight=1,
         ),
         Kind(
             "solving",
             "solve",
-            ("problems", "solver=best,annealing,dmm", "seed=0,1", "solver.n_restarts=8", "--output")
-            + ("run/results.csv",),
+            ("problems", "solver=best,annealing,dmm", "seed=0,1", "solver.n_restarts=8", "--output", "run/results.csv"),
             _PROBLEMS,
             weight=4,
         ),
         Kind(
             "solving, 2 workers",
             "solve",
-            ("problems", "solver=best,annealing", "seed=0,1", "solver.n_restarts=8", "--output")
-            + ("run/results.csv", "--workers", "2"),
+            ("problems", "solver=best,annealing", "seed=0,1", "solver.n_restarts=8", "--output", "run/results.csv", "--workers", "2"),
             _PROBLEMS,
             weight=1,
         ),

@@ -184,13 +184,19 @@ def _vanishes(case: Case) -> None:
     names = [path.name for path in (case.place / "second").iterdir() if path.name == "run"]
     away = case.here.with_name("away")
 
-    def act(_: Any) -> None:
-        away.mkdir()
+    away.mkdir()
+
+    def act(program: Any) -> None:
+        until = time.monotonic() + 10 * case.ended.seconds
+        while not any((case.here / "run").rglob("*.*")) and time.monotonic() < until:
+            time.sleep(0.002)
+        time.sleep(case.draws.random() * case.ended.seconds / 2)
         for name in names:
             with suppress(FileNotFoundError):
                 (case.here / name).rename(away / name)
 
-    goes = case.heard(case.live(meanwhile=_after(case, act)))
+    case.moment = "after its folder was made"
+    goes = case.heard(case.live(meanwhile=act))
     for path in away.iterdir():
         if (case.here / path.name).exists():
             anew = sorted(str(p.relative_to(case.here)) for p in (case.here / path.name).rglob("*"))
