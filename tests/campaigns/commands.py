@@ -1,7 +1,7 @@
 """Small runs of the commands, each in a folder and a process group of its own, and what they leave.
 
-Programs are forks of a process that has imported the package (``tests/integration/warm.py``): most of the time of a
-short one is that of its imports. What is forked is the command itself, as typed, from its first line to its end.
+Programs are forks of a process that has imported the package (``tests/integration/warm.py``): most of the time of
+a short one is that of its imports. What is forked is the command itself, as typed, from its first line to its end.
 """
 
 import csv
@@ -118,7 +118,12 @@ class Kind:
 
 _TINY = ("callbacks=minimal", "logger=none", "checkpoint_every=1", "hydra.run.dir=run")
 _BARS = (*_TINY, "data=shifting_bars", "data.source.copies=3", "sampler=pcd", "sampler.n_chains=7")
-_SWEPT = (*tuple(o for o in _BARS[:-2] if "hydra" not in o), *("model.hidden_sizes=[5,4]", "pretrain.iterations=4", "finetune.iterations=3"))
+_SWEPT = (
+    *("-m", *(o for o in _BARS[:-2] if "hydra" not in o), "sampler=cd,pcd", "hydra.sweep.dir=run"),
+    *("model.hidden_sizes=[5,4]", "pretrain.iterations=4", "finetune.iterations=3"),
+)
+_SOLVE = ("problems", "seed=0,1", "solver.n_restarts=8", "--output", "run/results.csv")
+_MACHINE = ("model=boltzmann", "model.n_hidden=3", "pretrain=boltzmann")
 _TWO = ("model.hidden_sizes=[5,4]", "pretrain.iterations=8", "finetune.iterations=6")
 _PEOPLE = "id,age,sex,colour,species\n" + "".join(
     f"{i},{20 + 7 * (i % 5) + i % 3},{'fm'[i % 2]},{['red', 'green', '', 'blue'][i % 4]},{['cat', 'dog'][i % 2]}\n"
@@ -173,7 +178,7 @@ KINDS = {
         Kind(
             "machine",
             "train",
-            (*_BARS, "model=boltzmann", "model.n_hidden=3", "pretrain=boltzmann", "finetune.iterations=0", "pretrain.iterations=12"),
+            (*_BARS, *_MACHINE, "finetune.iterations=0", "pretrain.iterations=12"),
             resumes=True,
         ),
         _GAPS,
@@ -193,7 +198,10 @@ KINDS = {
         Kind(
             "mode-assisted",
             "train",
-            (*_BARS[:6], *_TWO, "sampler=mode_assisted_pcd", "sampler.inner.n_chains=11", "sampler.schedule.p_max=0.5", "solver.n_restarts=3"),
+            (
+                *(*_BARS[:6], *_TWO, "sampler=mode_assisted_pcd", "sampler.inner.n_chains=11"),
+                *("sampler.schedule.p_max=0.5", "solver.n_restarts=3"),
+            ),
             resumes=True,
         ),
         Kind("figure", "train", (*_FIGURE, "figure.workers=1"), resumes=True, weight=3),
@@ -203,26 +211,26 @@ KINDS = {
         Kind(
             "sweep",
             "train",
-            ("-m", "sampler=cd,pcd", *_SWEPT, "hydra.sweep.dir=run"),
+            _SWEPT,
             weight=3,
         ),
         Kind(
             "sweep by joblib",
             "train",
-            ("-m", "sampler=cd,pcd", *_SWEPT, "hydra.sweep.dir=run", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+            (*_SWEPT, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
             weight=1,
         ),
         Kind(
             "solving",
             "solve",
-            ("problems", "solver=best,annealing,dmm", "seed=0,1", "solver.n_restarts=8", "--output", "run/results.csv"),
+            (*_SOLVE, "solver=best,annealing,dmm"),
             _PROBLEMS,
             weight=4,
         ),
         Kind(
             "solving, 2 workers",
             "solve",
-            ("problems", "solver=best,annealing", "seed=0,1", "solver.n_restarts=8", "--output", "run/results.csv", "--workers", "2"),
+            (*_SOLVE, "solver=best,annealing", "--workers", "2"),
             _PROBLEMS,
             weight=1,
         ),
@@ -316,7 +324,7 @@ def send(leader: int, number: int) -> None:
             os.kill(leader, number)
 
 
-# ------------------------------------------------------------------------------------------------ what a run leaves
+# ----------------------------------------------------------------------------------------------- what a run leaves
 
 _TIMES = re.compile(r"wall_time(_s)?|us an update.*|seconds|curve|time_to_.*|sweeps_per_second|folder|run")
 """Names of what differs between two runs of the same."""

@@ -1,11 +1,11 @@
 """Faults of the machine: signals, memory, disks, clocks and folders. A run says what it lacked, and how to go on.
 
 ``python tests/campaigns/faults.py --out FOLDER --count 300``. A case is ``FAULT/KIND/SEED``. Nothing but the work
-since the last checkpoint may be lost: the command that the message names is taken from it and run, and what it leaves
-is compared with what an uninterrupted run left, bit for bit but for times. No message is a traceback.
+since the last checkpoint may be lost: the command that the message names is taken from it and run, and what it
+leaves is compared with what an uninterrupted run left, bit for bit but for times. No message is a traceback.
 
-Disks are small file systems in memory, which takes the rights to mount them; in ``disk at every page`` one grows by
-4 KiB with each attempt, so that there is no write at which it was not full. Memory is the limit of the address space.
+Disks are small file systems in memory, which takes the rights to mount them; in ``disk at every page`` one grows
+by 4 KiB with each attempt, so that it is full at one write after another. Memory is a limit of the address space.
 The clock is that of Python's ``time.time``, which jumps back by a day.
 """
 
