@@ -182,6 +182,7 @@ class RunFolder:
 
     def begin(self, stages: Sequence[str]) -> None:
         """Make the folders of the stages' checkpoints."""
+        self._require_there()
         for stage in stages:
             self.checkpoint(stage).parent.mkdir(parents=True, exist_ok=True)
 

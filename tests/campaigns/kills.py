@@ -1,10 +1,10 @@
 """Kills: SIGKILL at any moment of any kind of run, which goes on to the same bits.
 
 ``python tests/campaigns/kills.py --out FOLDER --count 1000``. A case is ``KIND/SEED``. The run is begun in a
-folder of its own and killed, with all its processes, at a moment that the seed draws: after a share of the time that
-an uninterrupted run takes, or just before one of its writes (a file opened for writing, renamed, removed; a folder
-made). It is resumed, killed again perhaps, and resumed until it is done; then all that it left is compared with
-what an uninterrupted run left, bit for bit but for times. One case in forty starts an interpreter anew.
+folder of its own and killed, with all its processes, at a moment that the seed draws: after a share of the time
+that an uninterrupted run takes, or just before one of its writes (a file opened for writing, renamed, removed; a
+folder made). It is resumed, killed again perhaps, and resumed until it is done; then all that it left is compared
+with what an uninterrupted run left, bit for bit but for times. One case in forty starts an interpreter anew.
 """
 
 import json

@@ -170,7 +170,7 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
         for name, (study, part, own) in studies.items():
             (folder.path / name).mkdir(exist_ok=True)
             study.train(part, own, folder.path / name)
-        report.main([*(str(folder.path / name) for name in studies), "--output", str(folder.report)])
+        report.write([folder.path / name for name in studies], folder.report)
     folder.forget_error()
 
 
