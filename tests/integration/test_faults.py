@@ -15,6 +15,7 @@ from running import QUIET, Outcome, launch
 
 from memcomp_lightning import files
 from memcomp_lightning.cli.commands import report
+from memcomp_lightning.errors import LostError
 from memcomp_lightning.modules import weights
 from memcomp_lightning.runs import pipeline
 
@@ -147,15 +148,27 @@ def test_an_error_names_the_file_and_not_the_one_beside_it(tmp_path: Path) -> No
     assert caught.value.filename == str(tmp_path / "a")
 
 
-def test_a_figure_whose_page_cannot_be_written(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its run goes on, not the report alone."""
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left on device", "run/figure4.svg"),
+            "run/figure4.svg cannot be written (No space left on device).",
+        ),
+        (LostError("a process was ended from outside."), "a process was ended from outside."),
+    ],
+)
+def test_a_figure_that_ends_before_its_page(
+    memcomp_train: Run, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    """Its run goes on, not the report alone, and not the same command in another folder."""
 
-    def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", "run/figure4.svg")
+    def ended(*_: Any) -> None:
+        raise error
 
     figure = ["experiment=figure4", "figure/curves=none", "data=digits", "data.partitions=2", "figure.passes=[1]"]
     small = ["figure.seeds=[0]", "figure.workers=1", "figure.iterations=[1]", "solver.max_steps=5"]
-    monkeypatch.setattr(report, "write_report", full)
+    monkeypatch.setattr(report, "write_report", ended)
     outcome = memcomp_train(*figure, *small, "solver.n_restarts=2", "hydra.run.dir=run")
-    assert "memcomp-train: run/figure4.svg cannot be written (No space left on device). Go on with" in outcome.err
+    assert f"memcomp-train: {said} Go on with" in outcome.err
     assert named(outcome) == ["resume=run"]
