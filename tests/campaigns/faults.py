@@ -6,8 +6,8 @@ leaves is compared with what an uninterrupted run left, bit for bit but for time
 
 Disks are small file systems in memory, which takes the rights to mount them; in ``disk at every page`` one grows
 by 4 KiB with each attempt, so that it is full at one write after another. Memory is a limit of the address space.
-The clock is that of Python's ``time.time``, which jumps back by a day; a fifth of the runs go on under libfaketime,
-where that is installed.
+The clock is that of Python's ``time.time``, which jumps back by a day; a fifth of the runs go on under
+libfaketime, where that is installed.
 """
 
 import random
@@ -203,8 +203,8 @@ def _vanishes(case: Case) -> None:
     goes = case.heard(ended := case.live(meanwhile=act))
     for path in away.iterdir():
         if (case.here / path.name).exists():  # what was begun there by one that did not end well is thrown away
-            if ended.status == 0:
-                case.found("it did not miss its folder, and made it anew")
+            if ended.status == 0 and (other := difference(case.here, case.place / "second")) is not None:
+                case.found(f"it did not miss its folder, made it anew, and ended well: {other}")
             shutil.rmtree(case.here / path.name)
         path.rename(case.here / path.name)
     if goes:
