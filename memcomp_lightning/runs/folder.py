@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import memcomp_lightning
 from memcomp_lightning import __version__
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import UserError, lost
 from memcomp_lightning.files import read_json, write_json, write_text
 from memcomp_lightning.runs.paths import is_path
 
@@ -106,7 +106,7 @@ class RunFolder:
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
-        """Make the folder; a UserError if it cannot be written, or was made with other settings."""
+        """Make the folder; a UserError if it may not be written, or was made with other settings."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if (settings := self.settings) is not None:
@@ -115,6 +115,8 @@ class RunFolder:
                 write_json(self.path / "overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
                 write_text(self.path / "settings.yaml", OmegaConf.to_yaml(config))
         except OSError as error:
+            if lost(error) is not None:  # another folder would not help
+                raise
             raise UserError(
                 f"run folder {self.path} cannot be written ({error.strerror}): choose another with "
                 "hydra.run.dir=PATH"

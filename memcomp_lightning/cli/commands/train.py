@@ -126,7 +126,7 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
         _many(config, folder, overrides)
         return None
     if _is_first_process():
-        folder.open(config, overrides)
+        _open(folder, config, overrides)
     result = folder.result
     if result is None:
         with _resumable(folder, config, overrides):
@@ -163,7 +163,7 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
 
 def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     """Train what a figure or a comparison needs, and write the report."""
-    folder.open(config, overrides)
+    _open(folder, config, overrides)
     with _resumable(folder, config, overrides):
         folder.check_source()
         studies = _studies(config, overrides)
@@ -172,6 +172,11 @@ def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
             study.train(part, own, folder.path / name)
         report.write([folder.path / name for name in studies], folder.report)
     folder.forget_error()
+
+
+def _open(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> None:
+    with going_on(lambda: shlex.join([COMMAND, *sys.argv[1:]])):
+        folder.open(config, overrides)
 
 
 @contextmanager
