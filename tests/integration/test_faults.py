@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import re
 import shlex
 import signal
@@ -171,3 +172,17 @@ def test_a_figure_that_ends_before_its_page(
     outcome = memcomp_train(*figure, *small, "solver.n_restarts=2", "hydra.run.dir=run")
     assert f"memcomp-train: {said} Go on with" in outcome.err
     assert named(outcome) == ["resume=run"]
+
+
+def test_a_log_that_cannot_be_written_costs_its_lines(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handler: logging.Handler, record: logging.LogRecord) -> None:
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError:
+            handler.handleError(record)
+
+    monkeypatch.setattr(logging.FileHandler, "emit", full)
+    assert memcomp_train(*SMALL, "hydra.run.dir=run").status == 0
+    outcome = memcomp_train("resume=run")  # which logs that it is finished
+    assert outcome.status == 0
+    assert "Logging error" not in outcome.err
