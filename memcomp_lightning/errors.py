@@ -1,11 +1,16 @@
 """How a setting is refused: name, value, what is allowed, what to do."""
 
+import errno
 from collections.abc import Collection
 from numbers import Integral
 
 
 class UserError(Exception):
     """Something that the user can put right; the message says how."""
+
+
+class LostError(UserError):
+    """Something outside of the run ended it; what it was is said, and not how to go on."""
 
 
 class SettingError(ValueError):
@@ -62,3 +67,40 @@ def require_parts(name: str, value: object, kind: str, parts: Collection[str]) -
     wanted = f", which has {', '.join(missing)}" if missing else ": an object, no class"
     remedy = f"Make one: {given}(...)." if isinstance(value, type) and not missing else ""
     require(complete, name, given, f"a {kind}{wanted}", remedy)
+
+
+_OF_THE_MACHINE = frozenset(
+    getattr(errno, name)
+    for name in ("ENOSPC", "EDQUOT", "EIO", "EROFS", "ENOMEM", "EMFILE", "ENFILE", "EAGAIN", "ESTALE", "ENOTCONN")
+    if hasattr(errno, name)
+)
+"""Errors of a full or lost disk, of memory, and of limits: nothing that was typed is wrong."""
+
+_MEMORY = ("allocate memory", "out of memory", "failed to map segment", "start new thread", "OpenBLAS")
+
+
+def lost(error: BaseException, *, any_file: bool = False) -> str | None:
+    """What the machine did not give, as a sentence; None where an error is of another kind.
+
+    With ``any_file`` each error of the system counts, such as that of a folder that has vanished: where a run has
+    begun, nothing that was typed is wrong.
+
+    >>> lost(MemoryError())
+    'memory ran out.'
+    >>> lost(OSError(errno.ENOSPC, "No space left on device", "run/stages.json"))
+    'run/stages.json cannot be written (No space left on device).'
+    """
+    if isinstance(error, LostError):
+        return str(error)
+    if isinstance(error, OSError) and error.errno not in (None, errno.ENOMEM):
+        if not any_file and error.errno not in _OF_THE_MACHINE:
+            return None
+        does = "written" if error.errno in _FULL else "read or written"
+        return f"{error.filename or 'a file'} cannot be {does} ({error.strerror})."
+    hidden = isinstance(error, RuntimeError | ImportError | OSError) and any(
+        part in str(error) for part in _MEMORY
+    )
+    return "memory ran out." if isinstance(error, MemoryError) or hidden else None
+
+
+_FULL = frozenset((errno.ENOSPC, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)))

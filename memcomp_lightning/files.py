@@ -4,8 +4,9 @@ import csv
 import io
 import json
 import os
+import platform
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -15,23 +16,71 @@ from memcomp_lightning.errors import UserError
 LARGEST_JSON = 256 * 2**20
 """Bytes of a file that is read whole: more than any that this package writes."""
 
+_MACHINE = platform.node().partition(".")[0] or "here"
+"""Stands in the names of files that are being written: a process number says nothing on another machine."""
+
+_tidied: set[tuple[int, Path]] = set()
+"""Folders in which a process has written, with its number: a fork is another."""
+
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar("waiting", default=None)
 """Files that are written, by their places, to which they move together; None where each moves by itself."""
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a file beside ``path`` to write; rename it on success, so that an interruption leaves the old one."""
-    partial, waiting = path.with_name(f".{path.name}.{os.getpid()}.partial"), _waiting.get()
+    """Give a file beside ``path`` to write; rename it on success, so that an interruption leaves the old one.
+
+    The first file of a process in a folder takes away what processes that were killed had begun there.
+    """
+    _tidy(path.parent)
+    partial, waiting = path.with_name(f".{path.name}.{_MACHINE}.{os.getpid()}.partial"), _waiting.get()
     try:
-        yield partial
-        if waiting is None:
-            partial.replace(path)
-        else:
-            waiting[path] = partial
+        with naming(path):
+            yield partial
+            if waiting is None:
+                partial.replace(path)
+            else:
+                waiting[path] = partial
     finally:
         if waiting is None or path not in waiting:
-            partial.unlink(missing_ok=True)
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an error of the system name the file that it is about; that of a full disk names none."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None:
+            error.filename, error.filename2 = str(path), None
+        raise
+
+
+def _tidy(folder: Path) -> None:
+    """Remove files that processes of this machine began in a folder, and did not live to finish."""
+    at = folder.absolute()
+    if (os.getpid(), at) in _tidied:
+        return
+    _tidied.add((os.getpid(), at))
+    with suppress(OSError):  # no folder; nothing of ours
+        for path in at.glob(f".*.{_MACHINE}.*.partial"):
+            writer = path.name.split(".")[-2]
+            if writer.isdecimal() and int(writer) != os.getpid() and not _lives(int(writer)):
+                path.unlink()
+
+
+def _lives(process: int) -> bool:
+    if os.name == "nt":  # a signal of 0 is no question there
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # somebody else's
+        return True
+    return True
 
 
 @contextmanager
@@ -42,7 +91,8 @@ def written_together() -> Iterator[None]:
     try:
         yield
         for path, partial in waiting.items():
-            partial.replace(path)
+            with naming(path):
+                partial.replace(path)
     finally:
         _waiting.reset(before)
         for partial in waiting.values():

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from joblib import Parallel, delayed
 from joblib.externals.loky import get_reusable_executor
 
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import LostError
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ def processes(n: int, heard: Callable[..., object]) -> Iterator[Do[Any]]:
     Ctrl-C reaches the first process alone. ``heard`` is called here with what is given to :func:`say` there.
 
     Raises:
-        UserError: A process was killed.
+        LostError: A process was killed.
     """
     key = os.urandom(16)
     with Listener(authkey=key) as listener:
@@ -51,8 +51,8 @@ def processes(n: int, heard: Callable[..., object]) -> Iterator[Do[Any]]:
             yield do
             done = True
         except BrokenProcessPool as error:
-            reason = "a process was ended from outside, perhaps as memory ran out. Fewer of them need less"
-            raise UserError(f"{reason}; what is finished is kept, and the same command goes on.") from error
+            reason = "a process was ended from outside, perhaps as memory ran out: fewer of them need less."
+            raise LostError(f"{reason} What is finished is kept.") from error
         except BaseException as error:
             for results in begun:  # what still runs is ended; otherwise it would be waited for
                 with suppress(type(error)):

@@ -1,6 +1,8 @@
 """``memcomp-solve`` with many problems: a table that grows by a row with each answer, and goes on where it was."""
 
 import re
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from memcomp_lightning.cli.overrides import check_command_line
 from memcomp_lightning.configuration.many_problems import Combination, answers, best_known, seen_from, tasks_of
 from memcomp_lightning.configuration.problems import PROBLEM_MISSING
 from memcomp_lightning.configuration.quoting import with_path
-from memcomp_lightning.errors import UserError, require, require_count
+from memcomp_lightning.errors import LostError, UserError, lost, require, require_count
 from memcomp_lightning.files import written_whole
 from memcomp_lightning.problems import read_problem
 from memcomp_lightning.runs import solve_table
@@ -105,6 +107,8 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
             read_problem(file)  # says so
     known = best_known(problems, options.best_known)
     combinations, table, folder = _checked(line, options)
+    named = [] if options.output else ["--output", str(short_path(table.absolute()))]
+    again = shlex.join([command, *sys.argv[1:], *named])
     rows = {solve_table.key(row): row for row in solve_table.read_rows(table)}
     tasks = [task for file in problems for task in tasks_of(file, combinations, table, folder)]
     todo = [task for task in tasks if not task.is_done(rows)]
@@ -134,11 +138,15 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
         if options.figure is not None and any(map(solve_table.is_answer, found)):
             _draw(options.figure, solve_table.curves(found, values, table.parent))
     except KeyboardInterrupt as stop:
-        place = f"--output {short_path(table.absolute())}"
-        raise KeyboardInterrupt(f"Finished rows are kept; the same command with {place} goes on.") from stop
-    except OSError as error:
+        raise KeyboardInterrupt(f"Finished rows are kept. Go on with: {again}") from stop
+    except (OSError, MemoryError, RuntimeError, LostError) as error:
+        if (said := lost(error)) is not None:
+            raise UserError(f"{said} Finished rows are kept. Go on with: {again}") from error
+        if not isinstance(error, OSError):
+            raise
         place = f"{error.filename or table} cannot be written ({error.strerror})"
-        raise UserError(f"{place}: choose another file with --output FILE.") from error
+        rest = f"choose another file with --output FILE. Finished rows are kept. Go on with: {again}"
+        raise UserError(f"{place}: {rest}") from error
     own = [rows[key] for key in label]
     return 1 if any(row["error"] for row in own) else 0 if all(map(solve_table.is_answer, own)) else NOT_FEASIBLE
 

@@ -41,7 +41,7 @@ def tolerant_streams() -> Iterator[list[OSError]]:
     Libraries print, too: loggers, progress bars, Hydra. Where the streams are closed, ``os.devnull`` takes their
     place, so that no file of the run is opened under their numbers.
     """
-    before, failures = (sys.stdout, sys.stderr), make_tolerant()
+    before, raises, failures = (sys.stdout, sys.stderr), logging.raiseExceptions, make_tolerant()
     try:
         yield failures
     finally:
@@ -49,11 +49,13 @@ def tolerant_streams() -> Iterator[list[OSError]]:
             if stream is not None:
                 stream.flush()
         sys.stdout, sys.stderr = before
+        logging.raiseExceptions = raises
 
 
 def make_tolerant() -> list[OSError]:
     """As :func:`tolerant_streams`, for the rest of this process, which a launcher may have started."""
     codecs.register_error("readable", _spelt_out)
+    logging.raiseExceptions = False  # the log of a run, too, may be on a disk that is full
     failures: list[OSError] = []
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)

@@ -4,6 +4,7 @@ import hashlib
 import itertools
 import os
 import re
+import shlex
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -32,7 +33,7 @@ from memcomp_lightning.configuration.composition import (
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_exists, explain
 from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.configuration.quoting import with_path
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import UserError, lost
 from memcomp_lightning.runs.paths import is_path
 
 LONGEST_NAME = 150
@@ -129,10 +130,16 @@ def check_command_line(
 
 
 @contextmanager
-def answering(line: CommandLine) -> Iterator[None]:
-    """Turn what Hydra raises on a checked command line into a UserError; take an unused folder away again."""
+def answering(line: CommandLine, command: str) -> Iterator[None]:
+    """Turn what Hydra raises on a checked command line into a UserError; take an unused folder away again.
+
+    What the machine did not give, room on a disk or memory, is told with the command that goes on.
+    """
+    before = os.environ.get(_AS_RAISED)
+    os.environ[_AS_RAISED] = "1"
     try:
-        yield
+        with going_on(lambda: shlex.join([command, *line.arguments])):
+            yield
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error)) from error
     except ValueError as error:
@@ -140,9 +147,27 @@ def answering(line: CommandLine) -> Iterator[None]:
             raise
         raise UserError(" ".join(str(error).split())) from error
     finally:
+        os.environ.pop(_AS_RAISED)
+        if before is not None:
+            os.environ[_AS_RAISED] = before
         if line.claimed is not None:
             with suppress(OSError):  # it is in use
                 line.claimed.rmdir()
+
+
+_AS_RAISED = "HYDRA_FULL_ERROR"
+"""Lets Hydra raise what it would print as a traceback."""
+
+
+@contextmanager
+def going_on(command: Callable[[], str], *, any_file: bool = False) -> Iterator[None]:
+    """Turn what the machine did not give into a UserError that names the command that goes on: see ``lost``."""
+    try:
+        yield
+    except Exception as error:
+        if (said := lost(error, any_file=any_file)) is None:
+            raise
+        raise UserError(f"{said} Go on with: {command()}") from error
 
 
 def claimed(folder: Path) -> Path:

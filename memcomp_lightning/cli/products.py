@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ from yaml import YAMLError
 from memcomp_lightning.cli.output import refuse, say
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.configuration.values import filled
-from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.errors import SettingError, UserError, lost
 from memcomp_lightning.files import written_together
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.trained.alone import LoadWarning
@@ -144,6 +145,7 @@ def carry_out(
 ) -> None:
     """Read the command line, and act; what the user can put right ends it by one line, with no file written."""
     typed = sys.argv[1:] if arguments is None else list(arguments)
+    again = shlex.join([usage.command, *typed])
     if {"--help", "-h"} & set(typed):
         say(usage.help)
         return
@@ -155,7 +157,13 @@ def carry_out(
                 f"{usage.command}: warning: {message}", error=True
             )
             act(places, settings)
-    except (UserError, SettingError, CheckpointError, OSError) as error:
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(f"No file was written. Go on with: {again}") from stop
+    except OSError as error:
+        said = lost(error)
+        rest = f" No file was written. Go on with: {again}"
+        refuse(usage.command, UserError(in_words(error) if said is None else said + rest))
+    except (UserError, SettingError, CheckpointError) as error:
         refuse(usage.command, UserError(in_words(error)))
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and "allocate memory" not in str(error):

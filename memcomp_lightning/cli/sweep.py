@@ -7,6 +7,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from memcomp_lightning.errors import LostError
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.sweep_table import sweep_table
 from memcomp_lightning.runs.table import short_path
@@ -16,17 +17,29 @@ class RememberSweepFolder(Callback):
     """Hydra callback: keeps the folder of the multirun of this process, for the table at its end."""
 
     folder: Path | None = None
+    made: int | None = None
+    """What the system calls the folder since its first job, of a launcher that runs jobs in this process."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: object) -> None:
         """Called once, before the jobs."""
-        RememberSweepFolder.folder = Path(config.hydra.sweep.dir).absolute()
+        RememberSweepFolder.folder, RememberSweepFolder.made = Path(config.hydra.sweep.dir).absolute(), None
+
+    def on_job_start(self, config: DictConfig, **kwargs: object) -> None:
+        """Called before each job, whose folder is there."""
+        if self.folder is not None and self.made is None:
+            RememberSweepFolder.made = self.folder.stat().st_ino
 
 
 def merge(folder: Path) -> tuple[str, int]:
     """Write the jobs of a sweep folder as ``table.csv``; return the table for the screen, and how many failed.
 
     Rows are settings, see :func:`sweep_table`. Reports of figures and comparisons are listed, and failed jobs.
+
+    Raises:
+        LostError: The folder is not the one in which the jobs began.
     """
+    if RememberSweepFolder.made not in (None, folder.stat().st_ino):
+        raise LostError(f"{folder} vanished while jobs ran, and was made anew without them: bring them back.")
     groups: dict[tuple[tuple[str, str], ...], list[dict[str, Any]]] = defaultdict(list)
     failed: list[tuple[str, str]] = []
     reports: list[Path] = []

@@ -256,8 +256,11 @@ class EnergyPretraining(StageModule):
         self.trainer.fit_loop.min_epochs = self._fewest_passes
 
     def on_fit_end(self) -> None:
-        """Hand over what a callback has put back where a resumed run had nothing left to train."""
+        """Keep and hand over, as at the end of training, where a resumed run had nothing left to train."""
+        at_its_end = self._nothing_was_left
         super().on_fit_end()
+        if at_its_end:
+            self._keep(self.phase)
         self.pretraining.hand_over()
 
     def _let_stop(self) -> None:

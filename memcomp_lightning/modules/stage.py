@@ -214,6 +214,14 @@ class StageModule(pl.LightningModule):
         """Take back streams and extra state, now that device and number of processes are settled."""
         self._started_at = time.perf_counter()
         check_schedules(self.schedules, self.trainer.optimizers)
+        self._take_back()
+
+    @property
+    def _nothing_was_left(self) -> bool:
+        """Whether a resumed training was at its end already: neither its start nor its end is then announced."""
+        return self._loaded is not None
+
+    def _take_back(self) -> None:
         if self._loaded is None:
             return
         states, self._loaded = self._loaded, None
@@ -237,7 +245,8 @@ class StageModule(pl.LightningModule):
         self._seconds_before, self._started_at = self.wall_time_s, None
 
     def on_fit_end(self) -> None:
-        """Raise a NotTrainedError if no optimiser step was taken."""
+        """Take back the state of a checkpoint of the last pass; raise a NotTrainedError if no step was taken."""
+        self._take_back()
         if self.trainer.global_step == 0 and not tries(self.trainer):
             raise NotTrainedError(
                 "the stage ended without an optimiser step: its weights are those it began with. A limit of "

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
@@ -46,10 +46,28 @@ class LastCheckpoint(ModelCheckpoint):
 
 
 def write_tensors(content: Mapping[str, object], path: Path) -> None:
-    """Write a file for :func:`torch.load`, whole or not at all, and its folder if there is none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as partial:
-        torch.save(content, partial)
+    """Write a file for :func:`torch.load`, whole or not at all, and its folder if there is none.
+
+    What that lies in is there: a run folder that has vanished is not made anew.
+    """
+    path.parent.mkdir(exist_ok=True)
+    with written_whole(path) as partial, partial.open("wb") as file:
+        save_tensors(content, file)
+
+
+def save_tensors(content: object, file: IO[bytes]) -> None:
+    """:func:`torch.save`, which hides what the system says of a full disk.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    try:
+        torch.save(content, file)
+    except RuntimeError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):
+            cause = cause.__context__
+        raise (cause or error) from None
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import memcomp_lightning
 from memcomp_lightning import __version__
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import UserError, lost
 from memcomp_lightning.files import read_json, write_json, write_text
 from memcomp_lightning.runs.paths import is_path
 
@@ -106,7 +106,7 @@ class RunFolder:
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
-        """Make the folder; a UserError if it cannot be written, or was made with other settings."""
+        """Make the folder; a UserError if it may not be written, or was made with other settings."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             if (settings := self.settings) is not None:
@@ -115,6 +115,8 @@ class RunFolder:
                 write_json(self.path / "overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
                 write_text(self.path / "settings.yaml", OmegaConf.to_yaml(config))
         except OSError as error:
+            if lost(error) is not None:  # another folder would not help
+                raise
             raise UserError(
                 f"run folder {self.path} cannot be written ({error.strerror}): choose another with "
                 "hydra.run.dir=PATH"
@@ -165,14 +167,30 @@ class RunFolder:
 
     def finish_stage(self, stage: str, record: Mapping[str, object]) -> None:
         """Note that a stage is done; its checkpoint is not needed any more."""
+        self._require_there()
         write_json(self.path / "stages.json", {**self.finished_stages, stage: record})
+        self.forget_checkpoint(stage)
+
+    def forget_checkpoint(self, stage: str) -> None:
+        """Remove the checkpoint of a stage that is done; a kill may have come between the two."""
         self.checkpoint(stage).unlink(missing_ok=True)
 
     def finish(self, result: Mapping[str, object]) -> None:
         """Write the result, with what produced it."""
+        self._require_there()
         origin = {"memcomp_lightning": __version__, **_machine()}
         write_json(self.path / "result.json", {**result, "origin": origin})
         self.forget_error()
+
+    def begin(self, stages: Sequence[str]) -> None:
+        """Make the folders of the stages' checkpoints."""
+        self._require_there()
+        for stage in stages:
+            self.checkpoint(stage).parent.mkdir(parents=True, exist_ok=True)
+
+    def _require_there(self) -> None:
+        """Raise an OSError if the folder has vanished, though somebody may have made another in its place."""
+        (self.path / "settings.yaml").stat()
 
     def fail(self, record: Mapping[str, object]) -> None:
         """Write why the run failed."""

@@ -69,11 +69,14 @@ def run(
             "held-out and test rows are judged by the mean of the class probabilities over %d draws.",
             N_DRAWS,
         )
+    if int(getattr(rank_zero_only, "rank", 0)) == 0:
+        folder.begin([stage.module.stage for stage in plan.stages])
     for stage in plan.stages:
         name = stage.module.stage
         if name in done and folder.weights(name).exists():
             load_weights(stage.module.network, folder.weights(name))
             records[name] = done[name]
+            folder.forget_checkpoint(name)
         else:
             with _threads_for(stage):
                 trainer = _fit(stage, make_trainer(stage), folder)

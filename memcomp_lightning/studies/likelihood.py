@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from memcomp_lightning import rng
 from memcomp_lightning.ambient import in_one_thread
 from memcomp_lightning.errors import SettingError
-from memcomp_lightning.files import inside, written_whole
+from memcomp_lightning.files import inside
 from memcomp_lightning.models import joint_model, stacked
-from memcomp_lightning.modules import EnergyPretraining
+from memcomp_lightning.modules import EnergyPretraining, save_weights
 from memcomp_lightning.samplers import positive_phase
 from memcomp_lightning.studies.accuracy import Progress
 from memcomp_lightning.studies.measures import MEASURES
@@ -90,8 +89,7 @@ class LikelihoodTrial(Trial):
                 if updates > measured:
                     _add(record, updates, seconds, [*(worst for _ in names), nothing, nothing])
         record = replace(record, held_out=-float(np.median(record.measured("score")[-1, n_reported:])))
-        with written_whole(weights_path(Path(self.folder), record)) as path:
-            torch.save(present_model().state_dict(), path)
+        save_weights(present_model(), weights_path(Path(self.folder), record))
         return [record]
 
 

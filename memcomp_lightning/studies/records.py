@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.files import write_text
+from memcomp_lightning.files import naming, write_text
 
 Measures = dict[str, list[list[float]]]
 Key = tuple[str, str, float | None, str, int | None, int | None, bool, int | None]
@@ -89,17 +89,19 @@ class Records:
     def __init__(self, folder: Path, file: str = "records.jsonl") -> None:
         self.path = folder / file
         self.all: list[Record] = []
-        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
+        text = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
+        lines = text.splitlines()
         for number, line in enumerate(lines, start=1):
             try:
                 self.all.append(Record(**json.loads(line)))
             except (json.JSONDecodeError, TypeError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
-                write_text(self.path, "".join(_line(record) for record in self.all))
+        if text and not text.endswith("\n"):  # the next record is a line of its own
+            write_text(self.path, "".join(_line(record) for record in self.all))
 
     def append(self, records: Sequence[Record]) -> None:
         """Add records to the list and to the file."""
-        with self.path.open("a", encoding="utf-8") as file:
+        with naming(self.path), self.path.open("a", encoding="utf-8") as file:
             file.write("".join(_line(record) for record in records))
         self.all += records
 

@@ -241,7 +241,7 @@ def test_ctrl_c_keeps_finished_rows(tmp_path: Path, workers: int) -> None:
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "memcomp-solve: interrupted. Finished rows are kept; the same command with --output results.csv" in err
+    assert "memcomp-solve: interrupted. Finished rows are kept. Go on with: memcomp-solve batch/b.sparse" in err
     assert "Traceback" not in err
     assert rows(str(tmp_path / "results.csv"))[0]["problem"] == "b"
     assert not list(tmp_path.rglob("*.partial"))

@@ -48,10 +48,10 @@ def only(found: Records, curve: str, iterations: int) -> Any:
 def no_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Records alone: drawing pictures takes longer than training small networks."""
 
-    def write_page(arguments: list[str]) -> None:
-        Path(arguments[-1]).touch()
+    def write_page(_: list[Path], output: Path) -> None:
+        output.touch()
 
-    monkeypatch.setattr(pages, "main", write_page)
+    monkeypatch.setattr(pages, "write", write_page)
 
 
 SAMPLERS = ["cd", "pcd", "dmm_qubo", "mode_assisted_pcd"]

@@ -219,7 +219,7 @@ def test_ctrl_c_while_a_command_is_checked(memcomp_train: Run, monkeypatch: pyte
     monkeypatch.setattr(trainers, "check_trainer", interrupt)
     outcome = memcomp_train(*SHORT)
     assert outcome.status == 130
-    assert outcome.err == "\nmemcomp-train: interrupted.\n"
+    assert outcome.err == f"\nmemcomp-train: interrupted. Go on with: memcomp-train {shlex.join(SHORT)}\n"
 
 
 def test_folders_are_claimed_by_one_alone(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A killed process goes on to the same bits."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,7 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from running import Outcome, launch
+from running import QUIET, Outcome, launch
+
+from memcomp_lightning.runs.folder import RunFolder
 
 Run = Callable[..., Outcome]
 RUN = [
@@ -71,6 +74,37 @@ def test_killed_run_goes_on_bit_for_bit(memcomp_train: Run, tmp_path: Path, stag
     found = weights(tmp_path)
     assert found.keys() == UNINTERRUPTED.keys()
     assert all(UNINTERRUPTED[key].equal(found[key]) for key in found)
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+@pytest.mark.parametrize("before", ["finish_stage", "forget_checkpoint"])
+def test_a_kill_after_the_last_pass_of_a_stage(memcomp_train: Run, stage: str, before: str) -> None:
+    """The checkpoint of the last pass has nothing left to train, but what the stage tells of itself."""
+    small = ["data=shifting_bars", "data.source.copies=3", "sampler=pcd", "sampler.n_chains=7", *QUIET]
+    small += ["model.hidden_sizes=[5,4]", "pretrain.iterations=3", "finetune.iterations=2", "checkpoint_every=1"]
+    assert memcomp_train(*small, "hydra.run.dir=whole").status == 0
+    original = getattr(RunFolder, before)
+
+    def killed(folder: RunFolder, name: str, *rest: object) -> None:
+        if name == stage:
+            raise KeyboardInterrupt
+        original(folder, name, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunFolder, before, killed)
+        assert memcomp_train(*small, "hydra.run.dir=run").status == 130
+    checkpoint = RunFolder(Path("run")).checkpoint(stage)
+    assert checkpoint.exists()
+    assert memcomp_train("resume=run").status == 0
+    assert not checkpoint.exists()
+    for name in ("pretrain", "finetune", "pretrain_chains"):
+        found, expected = (torch.load(f"{run}/weights/{name}.pt", weights_only=True) for run in ("run", "whole"))
+        assert str(found) == str(expected)
+    found, expected = (json.loads(Path(run, "result.json").read_text()) for run in ("run", "whole"))
+    for result in (found, expected):
+        for record in result["stages"].values():
+            assert record.pop("wall_time_s") > 0
+    assert found["stages"] == expected["stages"]
 
 
 def test_interrupt_says_how_to_go_on(tmp_path: Path) -> None:

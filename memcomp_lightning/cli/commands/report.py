@@ -1,12 +1,14 @@
 """``memcomp-report``: figures, tables and verdicts from run folders of ``experiment=figure4`` and the like."""
 
 import argparse
+import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from memcomp_lightning.cli.output import refuse, say
 from memcomp_lightning.configuration.errors import in_words
-from memcomp_lightning.errors import SettingError, UserError
+from memcomp_lightning.errors import SettingError, UserError, lost
 from memcomp_lightning.files import write_text
 from memcomp_lightning.runs.table import aligned, short_path
 from memcomp_lightning.runs.trust import require_no_links
@@ -36,13 +38,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.error = lambda message: refuse(COMMAND, UserError(f"{message}. {COMMAND} --help shows how."))  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
     try:
-        for folder in given.folders:
-            require_no_links(folder)
-        sections = [write_report(folder) for folder in given.folders]
-        output = given.output or given.folders[0] / "report.html"
-        write_text(output, page(sections))
+        write(given.folders, given.output or given.folders[0] / "report.html")
     except (UserError, SettingError, OSError) as error:
-        refuse(COMMAND, UserError(in_words(error)))
+        again = shlex.join([COMMAND, *(sys.argv[1:] if arguments is None else arguments)])
+        said = lost(error)
+        refuse(COMMAND, UserError(in_words(error) if said is None else f"{said} Go on with: {again}"))
+
+
+def write(folders: Sequence[Path], output: Path) -> None:
+    """Write the figures of run folders, and the page that has them all.
+
+    Raises:
+        UserError, SettingError: A folder is none of a figure, or holds what cannot be read.
+        OSError: Something cannot be written.
+    """
+    for folder in folders:
+        require_no_links(folder)
+    sections = [write_report(folder) for folder in folders]
+    write_text(output, page(sections))
     for section in sections:
         if section.verdicts:
             say(f"\n{section.title}\n{verdict_table(section.verdicts)}")

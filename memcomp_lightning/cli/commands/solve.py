@@ -2,6 +2,7 @@
 
 import math
 import os
+import shlex
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -159,10 +160,11 @@ def main() -> None:
             folders=("solve", "solve"),
         )
         sys.argv[1:] = line.arguments
-        with answering(line):
+        with answering(line, COMMAND):
             solve()
     except (UserError, SettingError, ProblemFileError) as error:
         refuse(COMMAND, error)
     except KeyboardInterrupt as interrupt:
-        rest = "Finished jobs keep their solutions." if "--multirun" in sys.argv else "No solution is written."
-        raise KeyboardInterrupt(str(interrupt) or rest) from interrupt
+        kept = "Finished jobs keep their solutions." if "--multirun" in sys.argv else "No solution is written."
+        again = shlex.join([COMMAND, *sys.argv[1:]])
+        raise KeyboardInterrupt(str(interrupt) or f"{kept} Go on with: {again}") from interrupt

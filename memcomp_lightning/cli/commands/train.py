@@ -6,7 +6,8 @@ import shlex
 import sys
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,7 +24,7 @@ from memcomp_lightning.cli.arguments import CommandLine, read
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.continued import Written, to_trust, with_settings_of_run
 from memcomp_lightning.cli.output import make_tolerant, refuse, say
-from memcomp_lightning.cli.overrides import answering, check_command_line, search_path
+from memcomp_lightning.cli.overrides import answering, check_command_line, going_on, search_path
 from memcomp_lightning.cli.search import check_searchable
 from memcomp_lightning.configuration import comparisons, densities, few_labels, figures, trajectory
 from memcomp_lightning.configuration.choice import for_trial, settle, tried_values
@@ -71,7 +72,9 @@ def train(config: DictConfig) -> float | None:
             refuse(COMMAND, error)
         if not in_sweep:
             raise
-        folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
+        record = {"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()}
+        with suppress(OSError):  # which may be what it failed by
+            folder.fail(record)
         log.error("Failed, the sweep goes on: %s", explain(error))
         return 0.0 if isinstance(error, DivergedError) else None
 
@@ -123,10 +126,10 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
         _many(config, folder, overrides)
         return None
     if _is_first_process():
-        folder.open(config, overrides)
+        _open(folder, config, overrides)
     result = folder.result
     if result is None:
-        try:
+        with _resumable(folder, config, overrides):
             config, choice = settle(config, folder)
             loggers = [instantiate(logger) for logger in config.logger.values() if logger is not None]
             pairs = [override.partition("=") for override in overrides if not override.startswith("hydra.")]
@@ -137,18 +140,19 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
                 folder.keep_history(history_with(earlier.folder, earlier.weights))
             if _is_first_process() and plan.described:
                 say(f"{plan.described}\n")
-            result = pipeline.run(
-                plan,
-                folder,
-                make_trainer=lambda stage: trainer_of(stage, config, folder, loggers),
-                loggers=loggers,
-                settings=_distinguishing_settings(config, by_name),
-                overrides=by_name,
-                seed=config.seed,
-                choice=choice,
-            )
-        except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns the first into the second
-            raise KeyboardInterrupt(_go_on(folder, config, overrides)) from stop
+            try:
+                result = pipeline.run(
+                    plan,
+                    folder,
+                    make_trainer=lambda stage: trainer_of(stage, config, folder, loggers),
+                    loggers=loggers,
+                    settings=_distinguishing_settings(config, by_name),
+                    overrides=by_name,
+                    seed=config.seed,
+                    choice=choice,
+                )
+            except SystemExit as stop:  # as Lightning ends after a KeyboardInterrupt
+                raise KeyboardInterrupt from stop
     else:
         log.info("%s is finished already", folder.path)
     if _is_first_process():
@@ -159,22 +163,35 @@ def _train(config: DictConfig, folder: RunFolder, overrides: list[str]) -> float
 
 def _many(config: DictConfig, folder: RunFolder, overrides: list[str]) -> None:
     """Train what a figure or a comparison needs, and write the report."""
-    folder.open(config, overrides)
-    folder.check_source()
-    try:
+    _open(folder, config, overrides)
+    with _resumable(folder, config, overrides):
+        folder.check_source()
         studies = _studies(config, overrides)
         for name, (study, part, own) in studies.items():
             (folder.path / name).mkdir(exist_ok=True)
             study.train(part, own, folder.path / name)
-        report.main([*(str(folder.path / name) for name in studies), "--output", str(folder.report)])
-    except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(_go_on(folder, config, overrides)) from stop
+        report.write([folder.path / name for name in studies], folder.report)
     folder.forget_error()
 
 
-def _go_on(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> str:
-    line = [COMMAND, f"resume={short_path(folder.path)}", *to_trust(config, overrides, folder.path)]
-    return f"Go on with: {shlex.join(line)}"
+def _open(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> None:
+    with going_on(lambda: shlex.join([COMMAND, *sys.argv[1:]])):
+        folder.open(config, overrides)
+
+
+@contextmanager
+def _resumable(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> Iterator[None]:
+    """Name the command that goes on where a run that has begun is ended from outside."""
+
+    def command() -> str:
+        trusted = to_trust(config, overrides, folder.path)
+        return shlex.join([COMMAND, f"resume={short_path(folder.path)}", *trusted])
+
+    try:
+        with going_on(command, any_file=True):
+            yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(f"Go on with: {command()}") from stop
 
 
 def _is_first_process() -> bool:
@@ -200,8 +217,9 @@ def main() -> None:
                 except OSError as error:
                     raise UserError(in_words(error)) from error
                 sys.argv[1:] = line.arguments
-                with answering(line):
+                with answering(line, COMMAND):
                     train()
+                    _end_of_sweep()
         else:
             train()
     except UserError as error:
@@ -210,9 +228,15 @@ def main() -> None:
         if sweep.RememberSweepFolder.folder is not None:
             raise KeyboardInterrupt(f"Go on with: {shlex.join([COMMAND, *sys.argv[1:]])}") from interrupt
         raise
+
+
+def _end_of_sweep() -> None:
+    """Show the table of a sweep, if this was one, and end with whether a job failed."""
     if (folder := sweep.RememberSweepFolder.folder) is not None:
         table, n_failed = sweep.merge(folder)
         say(f"\n{table}\n{closing_lines(short_path(folder))}")
+        if n_failed:
+            say(f"Go on with: {shlex.join([COMMAND, *sys.argv[1:]])}")
         sys.exit(1 if n_failed else 0)
 
 
@@ -235,6 +259,7 @@ def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="The `srun` command is available")  # on each node of Slurm
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 
