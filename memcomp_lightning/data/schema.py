@@ -1,17 +1,16 @@
 """What the units of a trained model stand for: kept with it, so that what comes out is in the user's own terms."""
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from memcomp_lightning.array_files import ArrayFileError, opened_arrays
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.errors import UserError, require_choice
@@ -151,15 +150,13 @@ class ImageSchema:
 def _array(path: Path) -> NDArray[Any]:
     """The array of a file ``.npy`` or ``.npz``: the only one, or ``x``."""
     try:
-        with path.open("rb") as file:
-            found = np.load(file, allow_pickle=False)
-            if isinstance(found, np.ndarray):
-                return found
-            names = found.files
+        with opened_arrays(path) as found:
+            if found.alone is not None:
+                return found.alone
+            names = found.names
             if len(names) == 1 or "x" in names:
-                array: NDArray[Any] = found["x" if "x" in names else names[0]]
-                return array
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+                return found["x" if "x" in names else names[0]]
+    except (OSError, ArrayFileError) as error:
         reason = "it is no .npy or .npz of numbers" if "pickle" in str(error) else error
         raise UserError(f"{path} cannot be read as an array of pictures: {reason}") from error
     raise UserError(f"{path} holds the arrays {', '.join(names) or 'none'}: call the one of the pictures x.")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, inside, read_json, write_text
-from memcomp_lightning.problems.files.numbers import NUMBER
+from memcomp_lightning.problems.files.numbers import fits
 from memcomp_lightning.runs import table
 
 COLUMNS = (
@@ -68,7 +68,7 @@ def read_best_known(path: Path) -> dict[str, str]:
         raise UserError(f"best_known={path}: expected name,value in its first line, then a problem a line.")
     known: dict[str, str] = {}
     for number, line in enumerate(lines[1:], start=2):
-        if line and (len(line) != 2 or not line[0] or NUMBER.fullmatch(line[1]) is None):
+        if line and (len(line) != 2 or not line[0] or not fits(line[1])):
             found = f"found {','.join(line)!r}, expected a problem's name and a number"
             raise UserError(f"best_known={path}, line {number}: {found}.")
         if line and line[0] in known:

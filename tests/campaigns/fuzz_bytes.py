@@ -2,9 +2,9 @@
 
     python tests/campaigns/fuzz_bytes.py --out runs/fuzz_bytes
 
-atheris varies them so that new lines of the readers run; where it is not installed, bytes are changed at random. Each
-batch is a process of its own, so that one which dies or hangs is a finding like others. What is wrong is written to
-``findings`` in the folder, with the line that shows it again.
+atheris varies them so that new lines of the readers run; where it is not installed, bytes are changed at random.
+Each batch is a process of its own, so that one which dies or hangs is a finding like others. What is wrong is
+written to ``findings`` in the folder, with the line that shows it again.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from typing import Any, NoReturn
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import ledger  # noqa: E402 (beside this file, which is no package)
+import ledger
 
 PER_BATCH = 20_000
 """Inputs of a batch of a reader whose share is 1 or more."""
@@ -43,7 +43,7 @@ LONGEST = 4096
 
 
 def changed(generator: random.Random, seeds: Sequence[bytes], words: Sequence[bytes]) -> bytes:
-    """A seed with a few changes: bits, bytes, words of the format, parts that are doubled, lost or of another seed."""
+    """A seed with a few changes: bits, bytes, words of the format, parts doubled, lost or of another seed."""
     data = bytearray(generator.choice(seeds))
     for _ in range(generator.choice((1, 1, 1, 2, 3, 8))):
         at = generator.randrange(len(data) + 1)
@@ -230,7 +230,9 @@ def _watched(child: int, progress: Path) -> str | None:
     code = os.waitstatus_to_exitcode(status)
     if code == 0:
         return None
-    return f"ends the process by {signal.Signals(-code).name}" if code < 0 else f"ends the process with status {code}"
+    return (
+        f"ends the process by {signal.Signals(-code).name}" if code < 0 else f"ends the process with status {code}"
+    )
 
 
 def prepare() -> None:

@@ -26,10 +26,18 @@ BYTES = 512 * 2**20
 LONGEST = 1500
 """Characters of a message that people read, without paths."""
 
-REFUSALS: tuple[type[Exception], ...] = (UserError, SettingError, ProblemFileError, CheckpointError, CorruptFileError)
+REFUSALS: tuple[type[Exception], ...] = (
+    UserError,
+    SettingError,
+    ProblemFileError,
+    CheckpointError,
+    CorruptFileError,
+)
 """Errors that the commands turn into a line."""
 
-_MEMORY = re.compile(r"allocat|malloc|realloc|out of memory|bad_alloc", re.IGNORECASE)
+_MEMORY = re.compile(
+    r"(unable|failed|n't|cannot|not) (to )?(re)?alloc|malloc|realloc|out of memory|bad_alloc", re.IGNORECASE
+)
 
 
 class WrongError(AssertionError):

@@ -26,7 +26,6 @@ from memcomp_lightning.problems import FORMATS, read_problem
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.solve_table import COLUMNS, read_best_known, read_rows
 from memcomp_lightning.runs.trust import foreign
-from memcomp_lightning.studies.records import Records
 from memcomp_lightning.trained.alone import schema_in
 from memcomp_lightning.trained.run import load
 
@@ -56,9 +55,25 @@ class Reader:
     needs: str | None = None
 
 
-# ---------------------------------------------------------------------------------------------------- problem files
+# --------------------------------------------------------------------------------------------------- problem files
 
-_TABLES = ("#", "%", "c ", "0", "1", "-1", "2.5", "1e9", "1e-300", "0e-9", "9007199254740993", "\n", "\r\n", "\t", ".")
+_TABLES = (
+    "#",
+    "%",
+    "c ",
+    "0",
+    "1",
+    "-1",
+    "2.5",
+    "1e9",
+    "1e-300",
+    "0e-9",
+    "9007199254740993",
+    "\n",
+    "\r\n",
+    "\t",
+    ".",
+)
 _SAID = ("# vartype=SPIN", "# vartype=BINARY", "# offset=3", "constant: 1", "scale=2", "\n# ")
 _MTX = ("%%MatrixMarket matrix ", "coordinate ", "array ", "integer", "real ", "pattern", "general", "symmetric")
 _CLAUSES = ("p cnf ", "p wcnf ", " 0\n", "h ", "%\n", "c\n", "-", "1 ", "top ", "999999999999999999 ")
@@ -113,8 +128,21 @@ def _npy(array: Any) -> bytes:
     return buffer.getvalue()
 
 
-_NPY = ("'descr': ", "'<f8'", "'|O'", "'<U4'", "'fortran_order': True", "'shape': (", "3, ", "1000000000", "\\x93NUMPY")
-_MATRIX, _BITS = _npy(np.arange(6.0).reshape(2, 3) / 6), _npy(np.arange(24, dtype=np.uint8).reshape(6, 4) % 5 % 2)
+_NPY = (
+    "'descr': ",
+    "'<f8'",
+    "'|O'",
+    "'<U4'",
+    "'fortran_order': True",
+    "'shape': (",
+    "3, ",
+    "1000000000",
+    "\\x93NUMPY",
+)
+_MATRIX, _BITS = (
+    _npy(np.arange(30.0).reshape(10, 3) % 7 / 6),
+    _npy(np.arange(24, dtype=np.uint8).reshape(6, 4) % 5 % 2),
+)
 
 
 def _zipped(members: dict[str, bytes]) -> bytes:
@@ -129,7 +157,7 @@ def _as_weight(data: bytes) -> bytes:
     return _zipped({"weight.npy": data, "b.npy": _npy(np.zeros(3)), "c.npy": _npy(np.ones(2))})
 
 
-# ------------------------------------------------------------------------------------------------ tables and arrays
+# ----------------------------------------------------------------------------------------------- tables and arrays
 
 
 def _table(path: Path) -> None:
@@ -143,7 +171,9 @@ def _table(path: Path) -> None:
 
 def _csv_seed() -> bytes:
     rows = [["age", "smoker", "city", "height"]]
-    rows += [[20 + 3 * k % 7, "yes" if k % 2 else "no", ("Rome", "Oslo", "")[k % 3], 1.5 + k / 7] for k in range(12)]
+    rows += [
+        [20 + 3 * k % 7, "yes" if k % 2 else "no", ("Rome", "Oslo", "")[k % 3], 1.5 + k / 7] for k in range(12)
+    ]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
@@ -232,7 +262,7 @@ _FASTA = (
 )
 
 
-# ------------------------------------------------------------------------------------------------- weights and runs
+# ------------------------------------------------------------------------------------------------ weights and runs
 
 
 def _torch(content: Any) -> bytes:
@@ -269,7 +299,12 @@ def _exported() -> bytes:
         return path.read_bytes()
 
 
-_PICKLE = ("ctorch._utils\n_rebuild_tensor_v2\n", "cos\nsystem\n", "cbuiltins\neval\n", "ccollections\nOrderedDict\n")
+_PICKLE = (
+    "ctorch._utils\n_rebuild_tensor_v2\n",
+    "cos\nsystem\n",
+    "cbuiltins\neval\n",
+    "ccollections\nOrderedDict\n",
+)
 
 
 @cache
@@ -315,8 +350,32 @@ def _of_folder(path: Path) -> None:
 
 
 _JSON = ("null", "true", "1e400", "NaN", "{}", "[]", '""', "[[", '{"', '": ', "-1", "0.5", "\\u0000", "Infinity")
-_YAML = ("_target_: ", "${", "}", "&a ", "*a", "!!python/object:", "- ", ": ", "null", "{", "[", "|\n", "~", "? ", "<<: ")
-_NAMED = ("memcomp_lightning.", "os.system", "torch.", "${oc.env:HOME}", "${hydra:runtime.output_dir}", "..", "/etc")
+_YAML = (
+    "_target_: ",
+    "${",
+    "}",
+    "&a ",
+    "*a",
+    "!!python/object:",
+    "- ",
+    ": ",
+    "null",
+    "{",
+    "[",
+    "|\n",
+    "~",
+    "? ",
+    "<<: ",
+)
+_NAMED = (
+    "memcomp_lightning.",
+    "os.system",
+    "torch.",
+    "${oc.env:HOME}",
+    "${hydra:runtime.output_dir}",
+    "..",
+    "/etc",
+)
 _RECORD = (
     b'{"method": "cd", "iterations": 5, "seed": 0, "at": [1, 2], "seconds": [0.5, 1.0], "measures": '
     b'{"test_accuracy": [[0.5, 0.6], [0.7, 0.8]]}}\n'
@@ -343,28 +402,50 @@ READERS = {
     "gzip": Reader(
         "problem.gset.gz", lambda path: _scored(path, "gset"), lambda: [gzip.compress(_PROBLEMS["gset"][0][0])]
     ),
-    "rbm": Reader("model.npz", lambda path: _scored(path, "rbm"), lambda: [_MATRIX], _NPY, _as_weight, 2),
+    "rbm": Reader(
+        "model.npz",
+        lambda path: _scored(path, "rbm"),
+        lambda: [_npy(np.arange(6.0).reshape(2, 3) - 2)],
+        _NPY,
+        _as_weight,
+        2,
+    ),
     "csv": Reader("table.csv", _table, lambda: [_csv_seed(), b"1;2\n3;4\n5;6\n"], _CSV, share=6, needs="pyarrow"),
     "tsv": Reader("table.tsv", _table, lambda: [_csv_seed().replace(b",", b"\t")], _CSV, needs="pyarrow"),
     "parquet": Reader("table.parquet", _table, lambda: [_parquet()], needs="pyarrow"),
-    "excel": Reader("table.xlsx", _table, lambda: [_sheet()], ("<v>", "</c>", "t="), _in_workbook, 0.2, needs="openpyxl"),
+    "excel": Reader(
+        "table.xlsx", _table, lambda: [_sheet()], ("<v>", "</c>", "t="), _in_workbook, 0.2, needs="openpyxl"
+    ),
     "npy": Reader("table.npy", _table, lambda: [_MATRIX, _BITS], _NPY, share=3, needs="pyarrow"),
     "npz": Reader(
-        "table.npz", _table, lambda: [_npy(np.arange(6.0) % 4), _npy(np.array(list("abcabd")))], _NPY,
-        _as_columns, needs="pyarrow",
+        "table.npz",
+        _table,
+        lambda: [_npy(np.arange(6.0) % 4), _npy(np.array(list("abcabd")))],
+        _NPY,
+        _as_columns,
+        needs="pyarrow",
     ),
     "sparse": Reader(
         "table.npz", _table, lambda: [_sparse_indices()], _NPY, _with_sparse_indices, needs="pyarrow"
     ),
     "hdf5": Reader("table.h5", _table, lambda: [_hdf5()], needs="h5py"),
-    "fasta": Reader("family.fasta", _alignment, lambda: _FASTA, (">", "\n", "-", ".", "X", "?", "\r"), share=8, needs="Bio"),
+    "fasta": Reader(
+        "family.fasta", _alignment, lambda: _FASTA, (">", "\n", "-", ".", "X", "?", "\r"), share=8, needs="Bio"
+    ),
     "sequence table": Reader(
-        "family.csv", _alignment, lambda: [b"sequence,n\nACGT,1\nAC-T,2\nGCGT,3\nACGA,4\n"], _CSV, share=2, needs="Bio"
+        "family.csv",
+        _alignment,
+        lambda: [b"sequence,n\nACGT,1\nAC-T,2\nGCGT,3\nACGA,4\n"],
+        _CSV,
+        share=2,
+        needs="Bio",
     ),
     "pictures": Reader("pictures.npy", _pictures, lambda: [_MATRIX], _NPY, share=4),
     "idx": Reader(
-        "images", lambda path: idx.parse(path.read_bytes(), 3, "images"),
-        lambda: [bytes([0, 0, 8, 3, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 2, 1, 2, 3, 4])], share=4,
+        "images",
+        lambda path: idx.parse(path.read_bytes(), 3, "images"),
+        lambda: [bytes([0, 0, 8, 3, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 2, 1, 2, 3, 4])],
+        share=4,
     ),
     "weights": Reader("model.pt", load, lambda: [_weights()], share=2),
     "pickle": Reader("model.pt", load, lambda: [_pickled()], _PICKLE, _with_pickle, 4),
@@ -375,17 +456,35 @@ READERS = {
     "overrides": _in_run("overrides.json", _of_folder, _JSON, 0.3),
     "schema": Reader("schema.json", schema_in, lambda: [_run_file("schema.json")], _JSON, share=4),
     "records": Reader(
-        "records.jsonl", lambda path: _figure(path.parent), lambda: [_RECORD], _JSON, share=4,
+        "records.jsonl",
+        lambda path: _figure(path.parent),
+        lambda: [_RECORD],
+        _JSON,
+        share=4,
         beside=lambda folder: bool((folder / "figure.json").write_bytes(_FIGURE)) or None,
     ),
     "figure": Reader(
-        "figure.json", lambda path: _figure(path.parent), lambda: [_FIGURE], _JSON, share=3,
+        "figure.json",
+        lambda path: _figure(path.parent),
+        lambda: [_FIGURE],
+        _JSON,
+        share=3,
         beside=lambda folder: bool((folder / "records.jsonl").write_bytes(_RECORD)) or None,
     ),
-    "state": Reader("solution.json", lambda path: _state(str(path)), lambda: [b'{"assignment": [0, 1]}', b"01 1"], _JSON, share=2),
+    "state": Reader(
+        "solution.json",
+        lambda path: _state(str(path)),
+        lambda: [b'{"assignment": [0, 1]}', b"01 1"],
+        _JSON,
+        share=2,
+    ),
     "best known": Reader("best.csv", read_best_known, lambda: [b"name,value\nG1,11624\nG2,-3.5\n"], _CSV, share=3),
     "solved": Reader(
-        "solved.csv", read_rows, lambda: [(",".join(COLUMNS) + "\n" + "," * (len(COLUMNS) - 1) + "\n").encode()], _CSV, share=1
+        "solved.csv",
+        read_rows,
+        lambda: [(",".join(COLUMNS) + "\n" + "," * (len(COLUMNS) - 1) + "\n").encode()],
+        _CSV,
+        share=1,
     ),
 }
 """By name. A run folder is the slowest: its settings are composed."""
