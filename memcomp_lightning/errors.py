@@ -12,7 +12,12 @@ class Told(Exception):  # noqa: N818 (what errors have in common, none by itself
     """
 
     def __str__(self) -> str:
-        return printable(super().__str__())
+        text = printable(super().__str__())
+        return text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE - 505]} ... {text[-500:]}"
+
+
+LONGEST_MESSAGE = 2000
+"""Characters. A cell of a damaged file may be as long as the file; what to do stands at the end."""
 
 
 def printable(text: str) -> str:

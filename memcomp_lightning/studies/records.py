@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.files import write_text
+from memcomp_lightning.files import made_of, write_text
 
 Measures = dict[str, list[list[float]]]
 Key = tuple[str, str, float | None, str, int | None, int | None, bool, int | None]
@@ -89,11 +89,13 @@ class Records:
     def __init__(self, folder: Path, file: str = "records.jsonl") -> None:
         self.path = folder / file
         self.all: list[Record] = []
-        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else []
+        # Bytes that are no UTF-8 damage the line that they are in.
+        text = self.path.read_text(encoding="utf-8", errors="replace") if self.path.exists() else ""
+        lines = text.removesuffix("\n").split("\n") if text else []
         for number, line in enumerate(lines, start=1):
             try:
-                self.all.append(Record(**json.loads(line)))
-            except (json.JSONDecodeError, TypeError) as error:
+                self.all.append(_record(line))
+            except (ValueError, RecursionError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
                 write_text(self.path, "".join(_line(record) for record in self.all))
 
@@ -118,6 +120,15 @@ class Records:
         chosen = self.best_value(method)
         own = [r for r in self.all if r.method == method and not r.choosing and r.value == chosen]
         return sorted(own, key=lambda record: (record.iterations or 0, record.seed or 0))
+
+
+def _record(line: str) -> Record:
+    """The record of a line, each of its values of the type that it must have, for each measurement and replica."""
+    record = made_of(Record, json.loads(line))
+    n, tables = len(record.at), record.measures.values()
+    if len(record.seconds) != n or any(len(table) != n or len(set(map(len, table))) > 1 for table in tables):
+        raise ValueError("its measures are not as many as its times")
+    return record
 
 
 def _line(record: Record) -> str:

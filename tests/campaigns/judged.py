@@ -23,8 +23,8 @@ SECONDS = 1.0
 BYTES = 512 * 2**20
 """Above what the process had before, that reading an input may take."""
 
-LONGEST = 1500
-"""Characters of a message that people read, without paths."""
+LONGEST = 2000
+"""Characters of a message that people read."""
 
 REFUSALS: tuple[type[Exception], ...] = (
     UserError,
@@ -61,14 +61,16 @@ class Finding:
     text: str
 
 
-def judge(read: Callable[[], Any], refusals: tuple[type[BaseException], ...] = REFUSALS) -> Finding | None:
+def judge(read: Callable[[], Any], *, limits: bool = True) -> Finding | None:
     """Read an input; None if it was read, or refused as it should be.
 
-    Warnings of numbers that overflow count as errors: nobody would see them.
+    Warnings of numbers that overflow count as errors: nobody would see them. Without ``limits`` time and memory are
+    not looked at.
     """
-    _limit_memory()
+    if limits:
+        _limit_memory()
     signal.signal(signal.SIGVTALRM, _too_long)
-    signal.setitimer(signal.ITIMER_VIRTUAL, 3 * SECONDS)
+    signal.setitimer(signal.ITIMER_VIRTUAL, (3 if limits else 60) * SECONDS)
     began = time.process_time()
     error: BaseException | None = None
     try:
@@ -82,9 +84,9 @@ def judge(read: Callable[[], Any], refusals: tuple[type[BaseException], ...] = R
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         took = time.process_time() - began
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    if error is not None and (finding := _of_error(error, refusals)) is not None:
+    if error is not None and (finding := _of_error(error)) is not None:
         return finding
-    if took > SECONDS:
+    if limits and took > SECONDS:
         return Finding(f"slow {_place(error)}", f"took {took:.1f} s")
     return None
 
@@ -99,7 +101,7 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
 
 
-def _of_error(error: BaseException, refusals: tuple[type[BaseException], ...]) -> Finding | None:
+def _of_error(error: BaseException) -> Finding | None:
     kind, first = type(error).__name__, str(error).partition("\n")[0][:200]
     if isinstance(error, _TooLongError):
         return Finding(f"hang {_place(error)}", f"took more than {3 * SECONDS:g} s at {_place(error)}")
@@ -109,7 +111,7 @@ def _of_error(error: BaseException, refusals: tuple[type[BaseException], ...]) -
         if isinstance(cause, MemoryError) or _MEMORY.search(str(cause)):
             asked = f"asks for more than {BYTES // 2**20} MiB at {_place(error)}: {first}"
             return Finding(f"memory {_place(cause)}", asked)
-    if not isinstance(error, refusals):
+    if not isinstance(error, REFUSALS):
         return Finding(f"{kind} {_place(error)}", f"{kind} at {_place(error)}: {first}")
     if trouble := unclear(str(error)):
         mark = trouble.split(",")[0]
