@@ -125,9 +125,8 @@ class ImageSchema:
         outside = ~((array >= 0) & (array <= 1)) & ~np.isnan(array)
         if outside.any():
             row, pixel = np.argwhere(outside)[0].tolist()
-            raise UserError(
-                f"{path}, row {row + 1}, pixel {pixel}: {array[row, pixel]} is not a number in [0, 1]."
-            )
+            value = array[row, pixel]
+            raise UserError(f"{path}, row {row + 1}, pixel {pixel}: {value} is not a number in [0, 1].")
         v = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
         observed = None if not bool(v.isnan().any()) else ~v.isnan()
         return Rows(v.nan_to_num(nan=0.0), torch.full((len(v),), UNLABELLED, device="cpu"), observed)

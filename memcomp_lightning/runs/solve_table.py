@@ -44,7 +44,15 @@ def read_rows(path: Path) -> list[Row]:
         raise UserError(f"{path} cannot be read ({error}): choose another file with --output FILE.") from error
     if tuple(header) != COLUMNS or any(len(cells) != len(COLUMNS) for cells in lines):
         raise UserError(f"{path} is no table of this version's memcomp-solve: choose another with --output FILE.")
-    return [dict(zip(COLUMNS, cells, strict=True)) for cells in lines]
+    rows = [dict(zip(COLUMNS, cells, strict=True)) for cells in lines]
+    for number, row in enumerate(rows, start=1):
+        for name in ("value", "wall_time_s") if not row["error"] else ():
+            if not fits(row[name]):
+                raise UserError(
+                    f"{path}, row {number}: {name} is {row[name][:40]!r}, expected a number: choose another file with "
+                    "--output FILE."
+                )
+    return rows
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:

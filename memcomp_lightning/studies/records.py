@@ -94,7 +94,7 @@ class Records:
         lines = text.removesuffix("\n").split("\n") if text else []
         for number, line in enumerate(lines, start=1):
             try:
-                self.all.append(_record(line))
+                self.all.append(made_of(Record, json.loads(line)))
             except (ValueError, RecursionError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
                 write_text(self.path, "".join(_line(record) for record in self.all))
@@ -120,15 +120,6 @@ class Records:
         chosen = self.best_value(method)
         own = [r for r in self.all if r.method == method and not r.choosing and r.value == chosen]
         return sorted(own, key=lambda record: (record.iterations or 0, record.seed or 0))
-
-
-def _record(line: str) -> Record:
-    """The record of a line, each of its values of the type that it must have, for each measurement and replica."""
-    record = made_of(Record, json.loads(line))
-    n, tables = len(record.at), record.measures.values()
-    if len(record.seconds) != n or any(len(table) != n or len(set(map(len, table))) > 1 for table in tables):
-        raise ValueError("its measures are not as many as its times")
-    return record
 
 
 def _line(record: Record) -> str:

@@ -64,8 +64,8 @@ class Finding:
 def judge(read: Callable[[], Any], *, limits: bool = True) -> Finding | None:
     """Read an input; None if it was read, or refused as it should be.
 
-    Warnings of numbers that overflow count as errors: nobody would see them. Without ``limits`` time and memory are
-    not looked at.
+    Warnings of numbers that overflow count as errors: nobody would see them. Without ``limits`` time and memory
+    are not looked at.
     """
     if limits:
         _limit_memory()

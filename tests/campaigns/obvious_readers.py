@@ -1,7 +1,7 @@
 """Second readers of the formats, slow and plain: no array, no clever case, numbers as fractions.
 
-Each refuses with ``RefusedError`` what its format does not have, and with ``UnsureError`` where a file could be meant in
-several ways and this reader does not decide.
+Each refuses with ``RefusedError`` what its format does not have, and with ``UnsureError`` where a file could be meant
+in several ways and this reader does not decide.
 """
 
 import ast
@@ -31,7 +31,7 @@ class Meaning(NamedTuple):
     score: Callable[[Bits], tuple[Fraction, int]]
 
 
-# ---------------------------------------------------------------------------------------------------- problem files
+# ------------------------------------------------------------------------------------------------ problem files
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
@@ -319,7 +319,7 @@ PROBLEMS: dict[str, Callable[[bytes], Meaning]] = {
 """By format."""
 
 
-# --------------------------------------------------------------------------------------------------- tables, arrays
+# ----------------------------------------------------------------------------------------------- tables, arrays
 
 MISSING = ("", "NA", "N/A", "NaN", "nan", "null", "NULL", "None", "?")
 

@@ -24,7 +24,7 @@ from memcomp_lightning.data.images import PixelLayout
 from memcomp_lightning.data.schema import ImageSchema
 from memcomp_lightning.problems import FORMATS, read_problem
 from memcomp_lightning.runs.folder import RunFolder
-from memcomp_lightning.runs.solve_table import COLUMNS, read_best_known, read_rows
+from memcomp_lightning.runs.solve_table import COLUMNS, read_best_known, read_rows, summary, with_gaps
 from memcomp_lightning.runs.trust import foreign
 from memcomp_lightning.trained.alone import schema_in
 from memcomp_lightning.trained.run import load
@@ -396,6 +396,18 @@ def _figure(path: Path) -> None:
     results.table()
 
 
+def _solved() -> bytes:
+    row = dict.fromkeys(COLUMNS, "") | {
+        "file": "a.mc",
+        "direction": "maximise",
+        "value": "3",
+        "wall_time_s": "0.1",
+    }
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([COLUMNS, [row[name] for name in COLUMNS]])
+    return text.getvalue().encode()
+
+
 READERS = {
     **{name: _problem(name) for name in _PROBLEMS},
     "any problem": _any_problem(),
@@ -481,8 +493,8 @@ READERS = {
     "best known": Reader("best.csv", read_best_known, lambda: [b"name,value\nG1,11624\nG2,-3.5\n"], _CSV, share=3),
     "solved": Reader(
         "solved.csv",
-        read_rows,
-        lambda: [(",".join(COLUMNS) + "\n" + "," * (len(COLUMNS) - 1) + "\n").encode()],
+        lambda path: summary(with_gaps(read_rows(path), {})),
+        lambda: [_solved()],
         _CSV,
         share=1,
     ),
