@@ -48,10 +48,8 @@ def read_rows(path: Path) -> list[Row]:
     for number, row in enumerate(rows, start=1):
         for name in ("value", "wall_time_s") if not row["error"] else ():
             if not fits(row[name]):
-                raise UserError(
-                    f"{path}, row {number}: {name} is {row[name][:40]!r}, expected a number: choose another file with "
-                    "--output FILE."
-                )
+                found = f"{path}, row {number}: {name} is {row[name][:40]!r}, expected a number"
+                raise UserError(f"{found}: choose another file with --output FILE.")
     return rows
 
 

@@ -4,8 +4,8 @@
 
 hypothesis makes the choices; where it is not installed, they are made at random. What a file means is said by what
 it was made from, or, where it was spoilt, by the plain readers of ``obvious_readers.py``: a file that is read
-otherwise is a finding, as is one that is refused though it is valid. The overrides of a command line are composed by
-Hydra, a few a second: their number is ``--overrides``.
+otherwise is a finding, as is one that is refused though it is valid. The overrides of a command line are composed
+by Hydra, a few a second: their number is ``--overrides``.
 """
 
 import json

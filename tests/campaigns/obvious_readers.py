@@ -1,7 +1,7 @@
 """Second readers of the formats, slow and plain: no array, no clever case, numbers as fractions.
 
-Each refuses with ``RefusedError`` what its format does not have, and with ``UnsureError`` where a file could be meant
-in several ways and this reader does not decide.
+Each refuses with ``RefusedError`` what its format does not have, and with ``UnsureError`` where a file could be
+meant in several ways and this reader does not decide.
 """
 
 import ast
@@ -373,7 +373,7 @@ def npy(data: bytes) -> tuple[tuple[int, ...], list[float]]:
     (length,) = struct.unpack("<I" if wide else "<H", data[8:begin])
     try:
         header = ast.literal_eval(data[begin : begin + length].decode("latin1"))
-        order, kind, size = re.fullmatch(r"([<>|])([biuf])(\d)", header["descr"]).groups()  # type: ignore[union-attr]
+        order, kind, size = re.findall(r"\A([<>|])([biuf])(\d)\Z", header["descr"])[0]
         shape, in_columns = tuple(header["shape"]), header["fortran_order"]
     except Exception as error:
         raise RefusedError("header") from error
