@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from memcomp_lightning.errors import UserError
 
@@ -107,21 +107,22 @@ def made_of(kind: type[T], content: object) -> T:
     """
     if not isinstance(content, dict):
         raise ValueError(f"it is {_short(content)}, expected an object with named values")
-    hints = {field.name: _hints(kind)[field.name] for field in dataclasses.fields(cast(Any, kind))}
-    if unknown := [name for name in content if name not in hints]:
-        raise ValueError(f"{_short(unknown[0])} is not known here")
-    for field in dataclasses.fields(cast(Any, kind)):
+    of: Any = kind
+    fields, hints = dataclasses.fields(of), _hints(of)
+    if unknown := set(content) - {field.name for field in fields}:
+        raise ValueError(f"{_short(min(unknown))} is not known here")
+    for field in fields:
+        hint = hints[field.name]
         if field.name not in content:
             if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
                 raise ValueError(f"{field.name} is missing")
-        elif not _is_of(content[field.name], hints[field.name]):
-            expected = getattr(hints[field.name], "__name__", None) if not get_args(hints[field.name]) else None
-            expected = expected or str(hints[field.name]).replace("typing.", "")
+        elif not _is_of(content[field.name], hint):
+            expected = str(hint) if get_args(hint) else hint.__name__
             raise ValueError(f"{field.name} is {_short(content[field.name])}, expected {expected}")
     return kind(**content)
 
 
-_hints = cache(get_type_hints)
+_hints: Any = cache(get_type_hints)
 
 
 def _short(value: object) -> str:

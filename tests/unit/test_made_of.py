@@ -90,7 +90,7 @@ def test_a_value_is_missing():
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"[" * 100_000])
 def test_json_that_is_no_text_or_too_deep(tmp_path, content):
     (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(ValueError, match="no text in UTF-8|nested too deeply"):
+    with pytest.raises(ValueError, match=r"no text in UTF-8|nested too deeply"):
         read_json(tmp_path / "a.json")
 
 
