@@ -117,7 +117,7 @@ class ImageSchema:
     def read(self, path: Path, *, complete: bool = True) -> Rows:
         """Grey values of an array of rows or of pictures, ``.npy`` or ``.npz``; NaN is missing."""
         array = _array(path)
-        array = array.reshape(len(array), -1) if array.ndim > 1 else array
+        array = array.reshape(len(array), -1) if array.ndim > 1 and array.size else array
         if array.ndim != 2 or array.shape[1] != self.n_sites or not len(array):
             raise UserError(f"{path} has the shape {array.shape}: expected rows of {self.n_sites} pixels.")
         if array.dtype.kind not in "biuf":

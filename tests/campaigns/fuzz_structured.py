@@ -25,7 +25,7 @@ import fuzz_bytes
 import ledger
 import numpy as np
 import obvious_readers as obvious
-from judged import WrongError, judge
+from judged import REFUSALS, WrongError, judge
 
 from memcomp_lightning.problems import FORMATS, read_problem
 
@@ -252,6 +252,18 @@ def spoilt(dice: Dice, content: bytes, words: Sequence[bytes] = _WORDS) -> bytes
 def problem_of(name: str, dice: Dice) -> Input:
     content = _WRITERS[name](dice)
     return Input(spoilt(dice, content), False) if dice.number(0, 1) else Input(content, True)
+
+
+def unnamed_of(name: str, dice: Dice) -> Input:
+    """A valid file whose name does not say its format; lines that may be of several formats are refused."""
+    return Input(_WRITERS[name](dice), False)
+
+
+def check_unnamed(name: str, path: Path, given: Input) -> None:
+    """Read a problem whose format follows from its lines."""
+    if name.startswith("wcnf") and len(given.content.split()) == 2:
+        return  # one empty clause of some weight is a graph without edges, too
+    check_problem(name.removesuffix(" by its lines"), path, given, read=lambda path, _: read_problem(path))
 
 
 def check_problem(name: str, path: Path, given: Input, read: Callable[..., Any] = read_problem) -> None:
@@ -616,7 +628,7 @@ def _path(dice: Dice) -> tuple[str, str, Any]:
 _SETTINGS = (
     _whole("seed", 0),
     _whole("pretrain.iterations", 0),
-    _whole("data.batch_size", 1),
+    _whole("data.chunk_size", 1),
     _real,
     _list,
     _truth,
@@ -672,6 +684,11 @@ KINDS = {
         name: Kind(f"problem{FORMATS[name].suffixes[0]}", partial(problem_of, name), check_problem)
         for name in _WRITERS
     },
+    **{
+        f"{name} by its lines": Kind("problem.txt", partial(unnamed_of, name), check_unnamed, 0.3)
+        for name in _WRITERS
+        if name != "beasley"  # whose lines are those of the G-set: its files must say so
+    },
     "csv": Kind("table.csv", csv_of, check_csv, 0.5, "pyarrow"),
     "npy": Kind("table.npy", npy_of, check_npy, 0.5, "pyarrow"),
     "fasta": Kind("family.fasta", fasta_of, check_fasta, 0.5, "Bio"),
@@ -700,7 +717,7 @@ def tried(name: str, seed: str, count: int, folder: Path, kind: Kind | None = No
 
         def one(given: Input) -> None:
             path.write_bytes(given.content)
-            finding = judge(lambda: kind.check(name, path, given), limits=name != "override")
+            finding = judge(lambda: _checked(kind, name, path, given), limits=name != "override")
             if finding is not None and finding.mark not in marks:
                 marks[finding.mark] = f"{finding.text} Input: {given.content!r}"
                 fuzz_bytes.keep(folder, f"structured {name}", given.content, finding.mark, finding.text)
@@ -708,6 +725,16 @@ def tried(name: str, seed: str, count: int, folder: Path, kind: Kind | None = No
         for given in _inputs(kind, seed, count, one):
             one(given)
     return list(marks.values())
+
+
+def _checked(kind: Kind, name: str, path: Path, given: Input) -> None:
+    """Check an input; a valid one that is refused is wrong, too."""
+    try:
+        kind.check(name, path, given)
+    except REFUSALS as error:
+        if given.valid:
+            raise WrongError(f"a valid file is refused: {error}") from error
+        raise
 
 
 def _inputs(kind: Kind, seed: str, count: int, one: Callable[[Input], None]) -> Iterator[Input]:

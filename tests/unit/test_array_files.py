@@ -67,6 +67,13 @@ def test_large_numbers_are_no_grey_values(tmp_path):
         ImageSchema(PixelLayout(1, 3), 0).read(tmp_path / "a.npy")
 
 
+@pytest.mark.parametrize("shape", [(0, 3), (0, 0), (2, 0), (0, 1, 3)])
+def test_no_pictures(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.zeros(shape))
+    with pytest.raises(UserError, match="expected rows of 3 pixels"):
+        ImageSchema(PixelLayout(1, 3), 0).read(tmp_path / "a.npy")
+
+
 @pytest.mark.parametrize("index", [-1, 6, 2**31 - 1])
 def test_sparse_matrices_whose_indices_lie_outside(tmp_path, index):
     """SciPy would write there."""

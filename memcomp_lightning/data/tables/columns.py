@@ -200,11 +200,13 @@ class Real(Column):
         return found.astype(np.float32)
 
     def write(self, numbers: NDArray[np.floating[Any]]) -> NDArray[Any]:
-        """In the user's units, to the seven digits that single precision has."""
+        """In the user's units, to the seven digits that single precision has; whole where all cells are."""
         found = numbers.astype(np.float64) * self.scale + self.mean
         if not self.whole:
             return _rounded(found)
-        return found.round() if np.isnan(found).any() else found.round().astype(np.int64)
+        found = found.round()
+        exact = np.abs(found) <= 2**53  # not where NaN, either
+        return found.astype(np.int64) if exact.all() else found
 
     @property
     def described(self) -> str:

@@ -205,6 +205,14 @@ def test_numbers_that_are_too_far_from_the_mean(tmp_path: Path) -> None:
     refused(lambda: schema.read(other), "column 'a', row 2", "'1e29' is not allowed", "standard deviations")
 
 
+def test_whole_numbers_that_no_integer_holds_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "".join(f"{k}e20,{k % 3}.5\n" for k in (*range(N), 5)))
+    schema = Table(path=str(path)).load().schema
+    found = schema.decode(schema.read(path).v)["a"]
+    np.testing.assert_allclose(found, [k * 1e20 for k in (*range(N), 5)], rtol=1e-5, atol=1e14)
+
+
 def test_damaged_hdf5(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     hdf5(path, numbers())
