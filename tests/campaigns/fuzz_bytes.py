@@ -161,7 +161,7 @@ def attempt(case: str, *, folder: Path) -> ledger.Outcome:
     """Run one batch in a process of its own, forked from this one, where all is imported."""
     name, number, inputs = case.split("/")
     before = _notes(folder, name)
-    with tempfile.TemporaryDirectory(dir=_quick_place()) as scratch:
+    with tempfile.TemporaryDirectory(dir=quick_place()) as scratch:
         began, progress = time.monotonic(), Path(scratch) / "progress"
         child = os.fork()
         if child == 0:
@@ -207,7 +207,7 @@ def _notes(folder: Path, name: str) -> dict[str, str]:
     return {file: text for file, text in notes.items() if json.loads(text)["reader"] == name}
 
 
-def _quick_place() -> str | None:
+def quick_place() -> str | None:
     """A folder in memory, where there is one: each input is a file."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 

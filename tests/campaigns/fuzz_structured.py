@@ -8,6 +8,7 @@ otherwise is a finding, as is one that is refused though it is valid. The overri
 by Hydra, a few a second: their number is ``--overrides``.
 """
 
+import io
 import json
 import random
 import sys
@@ -397,16 +398,14 @@ def npy_of(dice: Dice) -> Input:
         array = (array / 8).astype(kind)
     if rarely(dice, 3):
         array = np.asfortranarray(array)
-    content = fuzz_bytes_npy(array)
+    content = npy_bytes(array)
     if not dice.number(0, 3):
         at = dice.number(0, len(content) - 1)
         return Input(content[:at] + bytes([dice.number(0, 255)]) + content[at + 1 :], False)
     return Input(content, True)
 
 
-def fuzz_bytes_npy(array: Any) -> bytes:
-    import io
-
+def npy_bytes(array: Any) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
@@ -712,7 +711,7 @@ def tried(name: str, seed: str, count: int, folder: Path, kind: Kind | None = No
     """A sentence for each kind of thing that is wrong."""
     kind = kind or (OVERRIDES if name == "override" else KINDS[name])
     marks: dict[str, str] = {}
-    with tempfile.TemporaryDirectory(dir=fuzz_bytes._quick_place()) as scratch:
+    with tempfile.TemporaryDirectory(dir=fuzz_bytes.quick_place()) as scratch:
         path = Path(scratch) / kind.file
 
         def one(given: Input) -> None:

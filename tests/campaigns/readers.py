@@ -57,25 +57,15 @@ class Reader:
 
 # --------------------------------------------------------------------------------------------------- problem files
 
-_TABLES = (
-    "#",
-    "%",
-    "c ",
-    "0",
-    "1",
-    "-1",
-    "2.5",
-    "1e9",
-    "1e-300",
-    "0e-9",
-    "9007199254740993",
-    "\n",
-    "\r\n",
-    "\t",
-    ".",
-)
+
+def _split(words: str) -> tuple[str, ...]:
+    return tuple(words.split())
+
+
+_BLANKS = ("\n", "\r\n", "\t")
+_TABLES = (*_split("# % c 0 1 -1 2.5 1e9 1e-300 0e-9 9007199254740993 ."), *_BLANKS)
 _SAID = ("# vartype=SPIN", "# vartype=BINARY", "# offset=3", "constant: 1", "scale=2", "\n# ")
-_MTX = ("%%MatrixMarket matrix ", "coordinate ", "array ", "integer", "real ", "pattern", "general", "symmetric")
+_MTX = _split("%%MatrixMarket matrix coordinate array integer real pattern general symmetric")
 _CLAUSES = ("p cnf ", "p wcnf ", " 0\n", "h ", "%\n", "c\n", "-", "1 ", "top ", "999999999999999999 ")
 _PROBLEMS: dict[str, tuple[tuple[bytes, ...], tuple[str, ...]]] = {
     "gset": ((b"4 3\n1 2 3\n2 3 -1\n1 4 2.5\n", b"3 2\n1 2\n3 1\n"), _TABLES),
@@ -128,17 +118,7 @@ def _npy(array: Any) -> bytes:
     return buffer.getvalue()
 
 
-_NPY = (
-    "'descr': ",
-    "'<f8'",
-    "'|O'",
-    "'<U4'",
-    "'fortran_order': True",
-    "'shape': (",
-    "3, ",
-    "1000000000",
-    "\\x93NUMPY",
-)
+_NPY = ("'descr': ", "'<f8'", "'|O'", "'<U4'", "'fortran_order': True", "'shape': (", "3, ", "1000000000")
 _MATRIX, _BITS = (
     _npy(np.arange(30.0).reshape(10, 3) % 7 / 6),
     _npy(np.arange(24, dtype=np.uint8).reshape(6, 4) % 5 % 2),
@@ -179,7 +159,7 @@ def _csv_seed() -> bytes:
     return text.getvalue().encode()
 
 
-_CSV = (",", "\n", "\r\n", '"', ";", "\t", "NA", "nan", "true", "False", "1e31", "-1", "inf", "0x1", "1_0", "\xa0")
+_CSV = (*_split(', ; " NA nan true False 1e31 -1 inf 0x1 1_0'), "\n", "\r\n", "\t", "\xa0")
 
 
 def _frame() -> Any:
@@ -349,33 +329,9 @@ def _of_folder(path: Path) -> None:
         foreign(folder.settings, path)
 
 
-_JSON = ("null", "true", "1e400", "NaN", "{}", "[]", '""', "[[", '{"', '": ', "-1", "0.5", "\\u0000", "Infinity")
-_YAML = (
-    "_target_: ",
-    "${",
-    "}",
-    "&a ",
-    "*a",
-    "!!python/object:",
-    "- ",
-    ": ",
-    "null",
-    "{",
-    "[",
-    "|\n",
-    "~",
-    "? ",
-    "<<: ",
-)
-_NAMED = (
-    "memcomp_lightning.",
-    "os.system",
-    "torch.",
-    "${oc.env:HOME}",
-    "${hydra:runtime.output_dir}",
-    "..",
-    "/etc",
-)
+_JSON = (*_split('null true 1e400 NaN {} [] "" [[ {" -1 0.5 Infinity'), '": ', "\\u0000")
+_YAML = ("_target_: ", "!!python/object:", ": ", "- ", "|\n", "? ", "<<: ", *_split("${ } &a *a null { [ ~"))
+_NAMED = (*_split("memcomp_lightning. os.system torch. ${oc.env:HOME} .. /etc"), "${hydra:runtime.output_dir}")
 _RECORD = (
     b'{"method": "cd", "iterations": 5, "seed": 0, "at": [1, 2], "seconds": [0.5, 1.0], "measures": '
     b'{"test_accuracy": [[0.5, 0.6], [0.7, 0.8]]}}\n'
@@ -386,6 +342,15 @@ _FIGURE = (
     b'{"name": "figure4", "title": "t", "data": "d", "against": "iterations", "passes": [1, 2], "claims": [], '
     b'"labels": {"cd": "CD", "pcd": "PCD"}, "chosen": {}, "stop_early": [], "scale": ""}'
 )
+
+
+def _with(name: str, content: bytes) -> Callable[[Path], None]:
+    """Writes one file beside the one that is varied."""
+
+    def beside(folder: Path) -> None:
+        (folder / name).write_bytes(content)
+
+    return beside
 
 
 def _figure(path: Path) -> None:
@@ -473,7 +438,7 @@ READERS = {
         lambda: [_RECORD],
         _JSON,
         share=4,
-        beside=lambda folder: bool((folder / "figure.json").write_bytes(_FIGURE)) or None,
+        beside=_with("figure.json", _FIGURE),
     ),
     "figure": Reader(
         "figure.json",
@@ -481,7 +446,7 @@ READERS = {
         lambda: [_FIGURE],
         _JSON,
         share=3,
-        beside=lambda folder: bool((folder / "records.jsonl").write_bytes(_RECORD)) or None,
+        beside=_with("records.jsonl", _RECORD),
     ),
     "state": Reader(
         "solution.json",

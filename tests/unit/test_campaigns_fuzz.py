@@ -21,7 +21,7 @@ import judged
 import obvious_readers
 import readers
 
-N = 25
+N = 10
 NEED_A_RUN = ("settings", "run", "schema of a run", "overrides", "schema")
 
 
