@@ -114,8 +114,11 @@ class Batch:
         keep(self.folder, self.name, content, finding.mark, finding.text)
 
 
-def keep(folder: Path, name: str, content: bytes, mark: str, text: str) -> None:
-    """Write an input that was found, with what was wrong and the line that shows it again."""
+def keep(folder: Path, name: str, content: bytes, mark: str, text: str, again: str | None = None) -> None:
+    """Write an input that was found, with what was wrong and the line that shows it again.
+
+    A smaller input takes the place of a larger one with the same mark.
+    """
     stem = f"{name.replace(' ', '_')}-{hashlib.sha256(mark.encode()).hexdigest()[:8]}"
     place = folder / "findings"
     place.mkdir(parents=True, exist_ok=True)
@@ -123,7 +126,7 @@ def keep(folder: Path, name: str, content: bytes, mark: str, text: str) -> None:
     if file.exists() and note.exists() and file.stat().st_size <= len(content):
         return
     file.write_bytes(content)
-    again = f"python tests/campaigns/fuzz_bytes.py --again {file}"
+    again = again or f"python tests/campaigns/fuzz_bytes.py --again {file}"
     note.write_text(json.dumps({"reader": name, "mark": mark, "text": text, "again": again}), encoding="utf-8")
 
 

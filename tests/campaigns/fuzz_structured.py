@@ -703,11 +703,11 @@ OVERRIDES = Kind("overrides", override_of, check_override)
 def attempt(case: str, *, folder: Path) -> ledger.Outcome:
     """Make and check the inputs of one batch."""
     name, number, count = case.split("/")
-    findings = tried(name, f"{name} {number}", int(count), folder)
+    findings = tried(name, number, int(count), folder)
     return ledger.Outcome(kind=name, tried=int(count), findings=findings)
 
 
-def tried(name: str, seed: str, count: int, folder: Path, kind: Kind | None = None) -> list[str]:
+def tried(name: str, number: str, count: int, folder: Path, kind: Kind | None = None) -> list[str]:
     """A sentence for each kind of thing that is wrong."""
     kind = kind or (OVERRIDES if name == "override" else KINDS[name])
     marks: dict[str, str] = {}
@@ -718,10 +718,11 @@ def tried(name: str, seed: str, count: int, folder: Path, kind: Kind | None = No
             path.write_bytes(given.content)
             finding = judge(lambda: _checked(kind, name, path, given), limits=name != "override")
             if finding is not None and finding.mark not in marks:
-                marks[finding.mark] = f"{finding.text} Input: {given.content!r}"
-                fuzz_bytes.keep(folder, f"structured {name}", given.content, finding.mark, finding.text)
+                again = f"python tests/campaigns/fuzz_structured.py --out OTHER --batch '{name}/{number}/{count}'"
+                marks[finding.mark] = f"{finding.text} Input: {given.content!r} Again: {again}"
+                fuzz_bytes.keep(folder, f"structured {name}", given.content, finding.mark, finding.text, again)
 
-        for given in _inputs(kind, seed, count, one):
+        for given in _inputs(kind, f"{name} {number}", count, one):
             one(given)
     return list(marks.values())
 
@@ -790,10 +791,12 @@ def cases(count: int, overrides: int) -> Iterator[str]:
 def main() -> int:
     lines = ledger.parser(__doc__, count=100_000, what="files")
     lines.add_argument("--overrides", type=int, default=10_000, help="override strings (default 10000)")
+    lines.add_argument("--batch", help="try one batch alone, as a finding names it: NAME/NUMBER/COUNT")
     given = lines.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     tries: Callable[[str], ledger.Outcome] = partial(attempt, folder=given.out)
-    return ledger.run(given.out, list(cases(given.count, given.overrides)), tries, workers=given.workers)
+    batches = [given.batch] if given.batch else list(cases(given.count, given.overrides))
+    return ledger.run(given.out, batches, tries, workers=given.workers)
 
 
 if __name__ == "__main__":
