@@ -16,6 +16,9 @@ from memcomp_lightning.files import made_of
 FARTHEST = 1e15
 """Standard deviations from the mean: sums of squares of such numbers still fit single precision."""
 
+EXACT = 2**53
+"""Whole numbers up to it are told apart by float64."""
+
 Numbers = NDArray[np.float32]
 Word = str | float | int
 
@@ -96,7 +99,7 @@ class Words(Column):
         """The word of each number."""
         missing = np.isnan(numbers)
         at = np.where(missing, 0, numbers).round().astype(np.int64)
-        whole = self.of_numbers and all(float(word).is_integer() for word in self.words)
+        whole = self.of_numbers and all(float(w).is_integer() and abs(float(w)) <= EXACT for w in self.words)
         if whole and not missing.any():
             return np.array([int(word) for word in self.words], dtype=np.int64)[at]
         if self.of_numbers:
@@ -205,7 +208,7 @@ class Real(Column):
         if not self.whole:
             return _rounded(found)
         found = found.round()
-        exact = np.abs(found) <= 2**53  # not where NaN, either
+        exact = np.abs(found) <= EXACT  # not where NaN, either
         return found.astype(np.int64) if exact.all() else found
 
     @property

@@ -213,6 +213,13 @@ def test_whole_numbers_that_no_integer_holds_come_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [k * 1e20 for k in (*range(N), 5)], rtol=1e-5, atol=1e14)
 
 
+def test_words_that_are_numbers_beyond_what_floats_tell_apart(tmp_path: Path) -> None:
+    """Of two keys one word would be made."""
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "".join(f"{9007199254740992 + k % 3},{k % 3}.5\n" for k in range(N)))
+    refused(Table(path=str(path), columns={"a": "category"}).load, "column 'a'", "2^53")
+
+
 def test_damaged_hdf5(tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     hdf5(path, numbers())
