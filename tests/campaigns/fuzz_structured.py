@@ -264,6 +264,9 @@ def check_unnamed(name: str, path: Path, given: Input) -> None:
     """Read a problem whose format follows from its lines."""
     if name.startswith("wcnf") and len(given.content.split()) == 2:
         return  # one empty clause of some weight is a graph without edges, too
+    words = [line.split() for line in given.content.decode("utf-8-sig").splitlines()]
+    if name.startswith("coo") and ["c"] in [line[:1] for line in words]:
+        return  # entries of 0 below a comment of DIMACS are clauses
     check_problem(name.removesuffix(" by its lines"), path, given, read=lambda path, _: read_problem(path))
 
 

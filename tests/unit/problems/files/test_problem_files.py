@@ -743,6 +743,12 @@ def test_a_zero_with_a_huge_power_of_ten_is_zero_at_once(write, name, text, word
     assert time.perf_counter() - begin < 1
 
 
+def test_clauses_or_entries_among_comments_of_both_kinds(write):
+    with pytest.raises(ProblemFileError, match="may be a clause or an entry"):
+        read_problem(write("a.txt", "# offset=0\nc words\n1 1 0\n"))
+    assert read_problem(write("b.txt", "c words\n1 1 0\n")).format == "wcnf"
+
+
 @pytest.mark.parametrize("kind", ["general", "symmetric"])
 def test_an_array_of_millions_of_rows_that_are_not_there(write, kind):
     path = write("a.mtx", f"%%MatrixMarket matrix array real {kind}\n10000000 10000000\n1\n")
