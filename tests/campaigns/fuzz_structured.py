@@ -706,12 +706,20 @@ OVERRIDES = Kind("overrides", override_of, check_override)
 def attempt(case: str, *, folder: Path) -> ledger.Outcome:
     """Make and check the inputs of one batch."""
     name, number, count = case.split("/")
-    findings = tried(name, number, int(count), folder)
-    return ledger.Outcome(kind=name, tried=int(count), findings=findings)
+    contents: list[int] = []
+    findings = tried(name, number, int(count), folder, contents=contents)
+    return ledger.Outcome(kind=name, tried=len(contents), findings=findings, facts={"bytes": sum(contents)})
 
 
-def tried(name: str, number: str, count: int, folder: Path, kind: Kind | None = None) -> list[str]:
-    """A sentence for each kind of thing that is wrong."""
+def tried(
+    name: str,
+    number: str,
+    count: int,
+    folder: Path,
+    kind: Kind | None = None,
+    contents: list[int] | None = None,
+) -> list[str]:
+    """A sentence for each kind of thing that is wrong; ``contents`` gets the bytes of each input."""
     kind = kind or (OVERRIDES if name == "override" else KINDS[name])
     marks: dict[str, str] = {}
     with tempfile.TemporaryDirectory(dir=fuzz_bytes.quick_place()) as scratch:
@@ -719,6 +727,8 @@ def tried(name: str, number: str, count: int, folder: Path, kind: Kind | None = 
 
         def one(given: Input) -> None:
             path.write_bytes(given.content)
+            if contents is not None:
+                contents.append(len(given.content))
             finding = judge(lambda: _checked(kind, name, path, given), limits=name != "override")
             if finding is not None and finding.mark not in marks:
                 again = f"python tests/campaigns/fuzz_structured.py --out OTHER --batch '{name}/{number}/{count}'"
