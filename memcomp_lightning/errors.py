@@ -5,7 +5,30 @@ from collections.abc import Collection
 from numbers import Integral
 
 
-class UserError(Exception):
+class Told(Exception):  # noqa: N818 (what errors have in common, none by itself)
+    r"""An error that is told to people: signs that cannot be printed are spelt out: strangers' files hold any.
+
+    >>> str(UserError("column 'a\x1b[2J' is empty"))
+    "column 'a\\x1b[2J' is empty"
+    """
+
+    def __str__(self) -> str:
+        text = printable(super().__str__())
+        return text if len(text) <= LONGEST_MESSAGE else f"{text[: LONGEST_MESSAGE - 505]} ... {text[-500:]}"
+
+
+LONGEST_MESSAGE = 2000
+"""Characters. A cell of a damaged file may be as long as the file; what to do stands at the end."""
+
+
+def printable(text: str) -> str:
+    """A text without signs that move a terminal's cursor or cannot be seen; line breaks stay."""
+    if text.replace("\n", "").isprintable():
+        return text
+    return "".join(sign if sign.isprintable() or sign == "\n" else repr(sign)[1:-1] for sign in text)
+
+
+class UserError(Told):
     """Something that the user can put right; the message says how."""
 
 
@@ -13,7 +36,7 @@ class LostError(UserError):
     """Something outside of the run ended it; what it was is said, and not how to go on."""
 
 
-class SettingError(ValueError):
+class SettingError(Told, ValueError):
     """A setting that does not exist or is out of range, met at construction."""
 
 

@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, and files of others, which are read with care."""
 
 import csv
+import dataclasses
 import io
 import json
 import os
@@ -8,10 +9,14 @@ import platform
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from memcomp_lightning.errors import UserError
+
+T = TypeVar("T")
 
 LARGEST_JSON = 256 * 2**20
 """Bytes of a file that is read whole: more than any that this package writes."""
@@ -128,8 +133,68 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"it has {size} bytes, more than the {LARGEST_JSON} that are read")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise ValueError("it is no text in UTF-8") from None
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+
+
+def made_of(kind: type[T], content: object) -> T:
+    """An instance of a dataclass from the plain values of a file: its fields by name, each of its type.
+
+    Raises:
+        ValueError: A field is missing, not known, or of another type; the message names it.
+
+    >>> @dataclasses.dataclass
+    ... class Point:
+    ...     x: float
+    ...     names: list[str] | None = None
+    >>> made_of(Point, {"x": 1})
+    Point(x=1, names=None)
+    >>> made_of(Point, {"x": "1"})
+    Traceback (most recent call last):
+    ValueError: x is '1', expected float
+    """
+    if not isinstance(content, dict):
+        raise ValueError(f"it is {_short(content)}, expected an object with named values")
+    of: Any = kind
+    fields, hints = dataclasses.fields(of), _hints(of)
+    if unknown := set(content) - {field.name for field in fields}:
+        raise ValueError(f"{_short(min(unknown))} is not known here")
+    for field in fields:
+        hint = hints[field.name]
+        if field.name not in content:
+            if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+                raise ValueError(f"{field.name} is missing")
+        elif not _is_of(content[field.name], hint):
+            expected = str(hint) if get_args(hint) else hint.__name__
+            raise ValueError(f"{field.name} is {_short(content[field.name])}, expected {expected}")
+    return kind(**content)
+
+
+_hints: Any = cache(get_type_hints)
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _is_of(value: object, hint: Any) -> bool:
+    """Whether a plain value of JSON is of a type; lists stand for tuples, whole numbers for others."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(_is_of(value, one) for one in inner)
+    if origin in (list, tuple):
+        return isinstance(value, list) and all(_is_of(entry, inner[0]) for entry in value)
+    if origin is dict:
+        pairs = value.items() if isinstance(value, dict) else ()
+        return isinstance(value, dict) and all(_is_of(entry, inner[1]) for _, entry in pairs)
+    if hint in (int, float):
+        return isinstance(value, (int, hint)) and not isinstance(value, bool)
+    return isinstance(value, hint or NoneType)
 
 
 def inside(folder: Path, name: str) -> Path:

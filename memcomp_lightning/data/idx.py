@@ -10,11 +10,13 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from memcomp_lightning.errors import Told
+
 _UNSIGNED_BYTE = 0x08
 """The type code of unsigned bytes, the third byte of the header."""
 
 
-class CorruptFileError(ValueError):
+class CorruptFileError(Told, ValueError):
     """A data file whose bytes are not what they must be."""
 
 
@@ -64,6 +66,8 @@ def parse(data: bytes, n_axes: int, source: str) -> UInt8[Tensor, "..."]:
             f"got {magic:#010x}."
         )
     n_values = math.prod(shape)
+    if not n_values:
+        raise CorruptFileError(f"{source}: expected values, got the shape {tuple(shape)} in its header.")
     if len(data) != header + n_values:
         raise CorruptFileError(
             f"{source}: expected {n_values} bytes for the shape {tuple(shape)} in its header, "

@@ -1,20 +1,20 @@
 """What the units of a trained model stand for: kept with it, so that what comes out is in the user's own terms."""
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from memcomp_lightning.array_files import ArrayFileError, opened_arrays
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.rows import UNLABELLED, Rows
-from memcomp_lightning.errors import UserError, require_choice
+from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.files import made_of
 from memcomp_lightning.models.units import Units
 
 Columns = dict[str, NDArray[Any]]
@@ -117,16 +117,17 @@ class ImageSchema:
     def read(self, path: Path, *, complete: bool = True) -> Rows:
         """Grey values of an array of rows or of pictures, ``.npy`` or ``.npz``; NaN is missing."""
         array = _array(path)
-        array = array.reshape(len(array), -1) if array.ndim > 1 else array
+        array = array.reshape(len(array), -1) if array.ndim > 1 and array.size else array
         if array.ndim != 2 or array.shape[1] != self.n_sites or not len(array):
             raise UserError(f"{path} has the shape {array.shape}: expected rows of {self.n_sites} pixels.")
         if array.dtype.kind not in "biuf":
             raise UserError(f"{path} has values of the kind {array.dtype}: expected numbers in [0, 1].")
+        outside = ~((array >= 0) & (array <= 1)) & ~np.isnan(array)
+        if outside.any():
+            row, pixel = np.argwhere(outside)[0].tolist()
+            value = array[row, pixel]
+            raise UserError(f"{path}, row {row + 1}, pixel {pixel}: {value} is not a number in [0, 1].")
         v = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
-        outside = ~(((v >= 0) & (v <= 1)) | v.isnan())
-        if bool(outside.any()):
-            row, pixel = outside.nonzero()[0].tolist()
-            raise UserError(f"{path}, row {row + 1}, pixel {pixel}: {v[row, pixel]} is not a number in [0, 1].")
         observed = None if not bool(v.isnan().any()) else ~v.isnan()
         return Rows(v.nan_to_num(nan=0.0), torch.full((len(v),), UNLABELLED, device="cpu"), observed)
 
@@ -144,22 +145,38 @@ class ImageSchema:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "ImageSchema":
         """The schema that was written."""
-        pixels = None if content["pixels"] is None else tuple(content["pixels"])
-        return cls(PixelLayout(content["height"], content["width"], pixels), content["n_classes"])
+        plain = made_of(_Plain, dict(content))
+        layout = PixelLayout(plain.height, plain.width, None if plain.pixels is None else tuple(plain.pixels))
+        for name, value in (("height * width", plain.height * plain.width), ("n_classes", plain.n_classes)):
+            require(0 <= value <= MOST_SITES, f"{name} of a schema", value, f"at most {MOST_SITES:,}")
+        return cls(layout, plain.n_classes)
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """A schema of pictures as it is written."""
+
+    data: str
+    height: int
+    width: int
+    pixels: list[int] | None
+    n_classes: int
+
+
+MOST_SITES = 1_000_000
+"""Of a schema that a file holds: more are taken for a misprint."""
 
 
 def _array(path: Path) -> NDArray[Any]:
     """The array of a file ``.npy`` or ``.npz``: the only one, or ``x``."""
     try:
-        with path.open("rb") as file:
-            found = np.load(file, allow_pickle=False)
-            if isinstance(found, np.ndarray):
-                return found
-            names = found.files
+        with opened_arrays(path) as found:
+            if found.alone is not None:
+                return found.alone
+            names = found.names
             if len(names) == 1 or "x" in names:
-                array: NDArray[Any] = found["x" if "x" in names else names[0]]
-                return array
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
+                return found["x" if "x" in names else names[0]]
+    except (OSError, ArrayFileError) as error:
         reason = "it is no .npy or .npz of numbers" if "pickle" in str(error) else error
         raise UserError(f"{path} cannot be read as an array of pictures: {reason}") from error
     raise UserError(f"{path} holds the arrays {', '.join(names) or 'none'}: call the one of the pictures x.")

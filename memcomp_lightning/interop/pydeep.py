@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
-import numpy as np
 import torch
 
+from memcomp_lightning.array_files import ArrayFileError, opened_arrays
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.interop.parameters import rbm_of, tensor_of
 from memcomp_lightning.models import RBM
@@ -90,9 +89,9 @@ def read_pydeep(path: str | Path) -> RBM:
     """
     path = Path(path)
     try:
-        found = np.load(path, allow_pickle=False)
-        arrays = {name: found[name] for name in found.files} if hasattr(found, "files") else None
-    except (ValueError, EOFError, BadZipFile) as error:
+        with opened_arrays(path) as found:
+            arrays = None if found.alone is not None else {name: found[name] for name in found.names}
+    except ArrayFileError as error:
         raise UserError(
             f"{path} is no .npz file: PyDeep's own files are pickles, which run code when they are read. Where "
             "PyDeep is installed, load it and type numpy.savez('rbm.npz', w=rbm.w, bv=rbm.bv, bh=rbm.bh, "

@@ -9,10 +9,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
+from memcomp_lightning.errors import Told
 from memcomp_lightning.files import written_whole
 
 
-class CheckpointError(ValueError):
+class CheckpointError(Told, ValueError):
     """A checkpoint that cannot be used, and why."""
 
 

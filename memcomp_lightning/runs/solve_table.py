@@ -7,7 +7,7 @@ from pathlib import Path
 
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import as_csv, inside, read_json, write_text
-from memcomp_lightning.problems.files.numbers import NUMBER
+from memcomp_lightning.problems.files.numbers import fits
 from memcomp_lightning.runs import table
 
 COLUMNS = (
@@ -44,7 +44,13 @@ def read_rows(path: Path) -> list[Row]:
         raise UserError(f"{path} cannot be read ({error}): choose another file with --output FILE.") from error
     if tuple(header) != COLUMNS or any(len(cells) != len(COLUMNS) for cells in lines):
         raise UserError(f"{path} is no table of this version's memcomp-solve: choose another with --output FILE.")
-    return [dict(zip(COLUMNS, cells, strict=True)) for cells in lines]
+    rows = [dict(zip(COLUMNS, cells, strict=True)) for cells in lines]
+    for number, row in enumerate(rows, start=1):
+        for name in ("value", "wall_time_s") if not row["error"] else ():
+            if not fits(row[name]):
+                found = f"{path}, row {number}: {name} is {row[name][:40]!r}, expected a number"
+                raise UserError(f"{found}: choose another file with --output FILE.")
+    return rows
 
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
@@ -68,7 +74,7 @@ def read_best_known(path: Path) -> dict[str, str]:
         raise UserError(f"best_known={path}: expected name,value in its first line, then a problem a line.")
     known: dict[str, str] = {}
     for number, line in enumerate(lines[1:], start=2):
-        if line and (len(line) != 2 or not line[0] or NUMBER.fullmatch(line[1]) is None):
+        if line and (len(line) != 2 or not line[0] or not fits(line[1])):
             found = f"found {','.join(line)!r}, expected a problem's name and a number"
             raise UserError(f"best_known={path}, line {number}: {found}.")
         if line and line[0] in known:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.errors import require
-from memcomp_lightning.files import naming, write_text
+from memcomp_lightning.files import made_of, naming, write_text
 
 Measures = dict[str, list[list[float]]]
 Key = tuple[str, str, float | None, str, int | None, int | None, bool, int | None]
@@ -89,14 +89,17 @@ class Records:
     def __init__(self, folder: Path, file: str = "records.jsonl") -> None:
         self.path = folder / file
         self.all: list[Record] = []
-        text = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
-        lines = text.splitlines()
+        # Bytes that are no UTF-8 damage the line that they are in.
+        text = self.path.read_text(encoding="utf-8", errors="replace") if self.path.exists() else ""
+        lines = text.removesuffix("\n").split("\n") if text else []
         for number, line in enumerate(lines, start=1):
             try:
-                self.all.append(Record(**json.loads(line)))
-            except (json.JSONDecodeError, TypeError) as error:
+                self.all.append(made_of(Record, json.loads(line)))
+            except (ValueError, RecursionError) as error:
                 require(number == len(lines), f"{self.path}, line {number}", line[:40], f"a record ({error})")
-        if text and not text.endswith("\n"):  # the next record is a line of its own
+        if len(self.all) < len(lines) or (
+            text and not text.endswith("\n")
+        ):  # the next record is a line of its own
             write_text(self.path, "".join(_line(record) for record in self.all))
 
     def append(self, records: Sequence[Record]) -> None:

@@ -75,7 +75,7 @@ def _read(reader: Callable[[Path], T], folder: Path) -> T:
         return reader(folder)
     except SettingError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise UserError(
             f"{folder}: its files are damaged, or another version wrote them ({type(error).__name__}: {error})"
         ) from error

@@ -9,10 +9,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
+from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, explain
 from memcomp_lightning.configuration.networks import Shape, network_of, units_of_settings
 from memcomp_lightning.configuration.plans import classifier_of
 from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
-from memcomp_lightning.errors import UserError, require
+from memcomp_lightning.errors import Told, UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.runs.folder import RunFolder
@@ -180,6 +181,18 @@ def _of_file(path: Path, network: nn.Module | None, schema: Schema | None, repli
 
 
 def _of_folder(path: Path, replica: int | None, trusted: Collection[str], place: _Place | None = None) -> Run:
+    try:
+        return _read_folder(path, replica, trusted, place)
+    except Told:
+        raise
+    except (*CONFIGURATION_ERRORS, LookupError, AttributeError, RuntimeError) as error:
+        raise UserError(
+            f"{path}: its settings.yaml or schema.json is damaged, or another version wrote it "
+            f"({type(error).__name__}: {' '.join(explain(error).split())[:200]}). Restore it."
+        ) from error
+
+
+def _read_folder(path: Path, replica: int | None, trusted: Collection[str], place: _Place | None) -> Run:
     folder = RunFolder(path)
     config = folder.settings
     if folder.overrides is None or config is None:

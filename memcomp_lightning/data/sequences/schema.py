@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from memcomp_lightning.data.rows import UNLABELLED, Rows
-from memcomp_lightning.data.sequences.alignment import Alignment, aligned
+from memcomp_lightning.data.schema import MOST_SITES
+from memcomp_lightning.data.sequences.alignment import INSERTIONS, Alignment, aligned
 from memcomp_lightning.data.sequences.alphabets import ALPHABETS, MISSING, Alphabet
 from memcomp_lightning.data.sequences.files import read_sequences
 from memcomp_lightning.data.written import SEQUENCE
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.files import made_of
 from memcomp_lightning.models.units import Categorical
 
 
@@ -141,13 +143,29 @@ class SequenceSchema:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "SequenceSchema":
         """The schema that was written."""
-        found = cls(content["n_sites"], content["alphabet"], content["insertions"])
-        if content["letters"] != found.letters:
+        plain = made_of(_Plain, dict(content))
+        require(1 <= plain.n_sites <= MOST_SITES, "n_sites of a schema", plain.n_sites, f"1 to {MOST_SITES:,}")
+        require_choice("alphabet of a schema", plain.alphabet, ALPHABETS)
+        if plain.insertions is not None:
+            require_choice("insertions of a schema", plain.insertions, INSERTIONS)
+        found = cls(plain.n_sites, plain.alphabet, plain.insertions)
+        if plain.letters != found.letters:
             raise UserError(
-                f"the schema has the letters {content['letters']} in this order, and {found.alphabet} has "
+                f"the schema has the letters {plain.letters} in this order, and {found.alphabet} has "
                 f"{found.letters}: it is that of another version."
             )
         return found
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """A schema of sequences as it is written."""
+
+    data: str
+    n_sites: int
+    alphabet: str
+    letters: str
+    insertions: str | None
 
 
 def rows_of(numbers: NDArray[np.uint8], weight: NDArray[np.float32] | None = None) -> Rows:

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.data.tables.cells import CellError, Cells
-from memcomp_lightning.errors import require_choice
+from memcomp_lightning.errors import require, require_choice
+from memcomp_lightning.files import made_of
+
+FARTHEST = 1e15
+"""Standard deviations from the mean: sums of squares of such numbers still fit single precision."""
+
+EXACT = 2**53
+"""Whole numbers up to it are told apart by float64."""
 
 Numbers = NDArray[np.float32]
 Word = str | float | int
@@ -68,6 +75,11 @@ class Words(Column):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "words", tuple(self.words))
+        texts = [isinstance(word, str) for word in self.words]
+        alike = len(self.words) > 0 and len(set(texts)) == 1 and len(set(self.words)) == len(self.words)
+        finite = all(texts) or all(math.isfinite(word) for word in self.words if not isinstance(word, str))
+        allowed = "one text or more, or one number, each once"
+        require(alike and finite, f"words of column {self.name!r}", self.words, allowed)
 
     @property
     def of_numbers(self) -> bool:
@@ -87,7 +99,7 @@ class Words(Column):
         """The word of each number."""
         missing = np.isnan(numbers)
         at = np.where(missing, 0, numbers).round().astype(np.int64)
-        whole = self.of_numbers and all(float(word).is_integer() for word in self.words)
+        whole = self.of_numbers and all(float(w).is_integer() and abs(float(w)) <= EXACT for w in self.words)
         if whole and not missing.any():
             return np.array([int(word) for word in self.words], dtype=np.int64)[at]
         if self.of_numbers:
@@ -178,16 +190,26 @@ class Real(Column):
     scale: float
     whole: bool = False
 
+    def __post_init__(self) -> None:
+        known = math.isfinite(self.mean) and 0 < self.scale < math.inf
+        require(known, f"mean and scale of column {self.name!r}", (self.mean, self.scale), "numbers, scale > 0")
+
     def read(self, cells: Cells) -> Numbers:
         """Deviations from the mean."""
-        return ((cells.numbers() - self.mean) / self.scale).astype(np.float32)
+        found = (cells.numbers() - self.mean) / self.scale
+        far = np.abs(found) > FARTHEST
+        if far.any():
+            raise CellError(int(far.argmax()), f"a number within {FARTHEST:g} standard deviations of the mean")
+        return found.astype(np.float32)
 
     def write(self, numbers: NDArray[np.floating[Any]]) -> NDArray[Any]:
-        """In the user's units, to the seven digits that single precision has."""
+        """In the user's units, to the seven digits that single precision has; whole where all cells are."""
         found = numbers.astype(np.float64) * self.scale + self.mean
         if not self.whole:
             return _rounded(found)
-        return found.round() if np.isnan(found).any() else found.round().astype(np.int64)
+        found = found.round()
+        exact = np.abs(found) <= EXACT  # not where NaN, either
+        return found.astype(np.int64) if exact.all() else found
 
     @property
     def described(self) -> str:
@@ -202,9 +224,9 @@ KINDS: dict[str, type[Column]] = {kind.kind: kind for kind in (Binary, SpinColum
 def column_of(content: Mapping[str, Any]) -> Column:
     """The column that :meth:`Column.as_json` wrote."""
     settings = dict(content)
-    kind = settings.pop("kind")
+    kind = str(settings.pop("kind", None))
     require_choice("kind of a column", kind, tuple(KINDS))
-    return KINDS[kind](**settings)
+    return made_of(KINDS[kind], settings)
 
 
 def _rounded(x: NDArray[np.float64], digits: int = 7) -> NDArray[np.float64]:

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from memcomp_lightning.data.tables.cells import Cells
-from memcomp_lightning.data.tables.columns import KINDS, Binary, Category, Column, Probability, Real, SpinColumn
+from memcomp_lightning.data.tables.columns import (
+    EXACT,
+    KINDS,
+    Binary,
+    Category,
+    Column,
+    Probability,
+    Real,
+    SpinColumn,
+)
 from memcomp_lightning.errors import UserError
 
 MOST_WORDS = 100
@@ -263,7 +272,7 @@ def _column(summary: Summary, kind: str | None, file: str) -> Column:
     if kind in ("binary", "category"):
         if summary.distinct is None:
             raise UserError(f"{place} has more than {_KEPT} different values: too many for a {kind} column.")
-        words = tuple(summary.words)
+        words = _told_apart(summary, place)
         if kind == "binary" and len(words) > 2:
             raise UserError(f"{place} has {len(words)} different values: too many for a binary column.")
         return Binary(name, words) if kind == "binary" else Category(name, words)
@@ -276,6 +285,18 @@ def _column(summary: Summary, kind: str | None, file: str) -> Column:
             raise UserError(f"{place} has {value} in all training rows: {_split_otherwise(name)}")
         return Real(name, summary.mean, summary.deviation, summary.whole)
     return SpinColumn(name) if kind == "spin" else Probability(name)
+
+
+def _told_apart(summary: Summary, place: str) -> tuple[Any, ...]:
+    """The words of a column; a UserError for numbers of which float64 would make one word of two."""
+    words = tuple(summary.words)
+    large = [word for word in words if not isinstance(word, str) and abs(word) > EXACT]
+    if large:
+        raise UserError(
+            f"{place} has words beyond 2^53, such as {large[0]}, not told apart as numbers: put a letter "
+            f"before them. {_typed(summary.name, 'ignore')}"
+        )
+    return words
 
 
 def _of_all(summaries: Sequence[Summary], file: str) -> Summary:
@@ -328,7 +349,7 @@ def _classes(summary: Summary, file: str, kind: str | None) -> Category:
         )
     if summary.distinct is None:
         raise UserError(f"{place} has more than {_KEPT} different values: too many for classes.")
-    words = tuple(summary.words)
+    words = _told_apart(summary, place)
     if words != (-1, 1) and kind != "category":
         words = tuple(word for word in words if word not in (-1, "-1"))
     if len(words) < 2:

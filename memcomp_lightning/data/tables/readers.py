@@ -3,6 +3,7 @@
 import csv
 import gzip
 import io
+import math
 import re
 import zlib
 from collections.abc import Iterator
@@ -10,16 +11,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
 
+from memcomp_lightning.array_files import opened_arrays
 from memcomp_lightning.data.tables.cells import EMPTY, Cells
 from memcomp_lightning.errors import UserError
 
 ROWS = 16_384
 """Rows that are read at a time, where a format lets one choose."""
+
+
+MOST_COLUMNS = 1_000_000
+"""Of an array: each is a unit of a model. More are taken for a misprint in a header."""
 
 
 class Opened(NamedTuple):
@@ -99,6 +104,11 @@ def of_array(array: Any, where: str = "") -> Opened:
         array = np.asarray(array)
     if len(array.shape) < 2:
         raise UserError(f"{where}an array of shape {array.shape}: expected rows and columns.")
+    if 0 in array.shape[1:]:
+        raise UserError(f"{where}an array of shape {array.shape}: expected one column or more.")
+    if math.prod(array.shape[1:]) > MOST_COLUMNS:
+        allowed = f"expected at most {MOST_COLUMNS:,} columns"
+        raise UserError(f"{where}an array of shape {array.shape}: {allowed}.")
     if array.dtype.kind in "cV":
         raise UserError(f"{where}an array of {array.dtype}: expected numbers, truth values or texts.")
     return Opened(_rows_of(array), False, array.shape[0])
@@ -124,7 +134,7 @@ def _checked(found: Opened, path: Path) -> Opened:
 def _damage(path: Path) -> Iterator[None]:
     try:
         yield
-    except (pa.ArrowException, OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error) as error:
+    except (pa.ArrowException, OSError, EOFError, ValueError, LookupError, RuntimeError, zlib.error) as error:
         if isinstance(error, UserError):
             raise
         raise _damaged(path, error) from error
@@ -220,11 +230,10 @@ def _excel(path: Path) -> Opened:
 def _array(path: Path, ending: str, key: str | None) -> Opened:
     with _damage(path):
         if ending == ".npy":
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-            if not isinstance(array, np.ndarray):
-                array.close()
-                raise UserError(f"{path} holds several arrays: let its name end in .npz.")
-            return of_array(array, f"{path}: ")
+            with opened_arrays(path, mapped=True) as found:
+                if found.alone is None:
+                    raise UserError(f"{path} holds several arrays: let its name end in .npz.")
+                return of_array(found.alone, f"{path}: ")
         if ending == ".npz":
             return _npz(path, key)
         try:
@@ -256,20 +265,29 @@ class _Dataset:
 
 
 def _npz(path: Path, key: str | None) -> Opened:
-    with path.open("rb") as opened_file:
-        file = np.load(opened_file, allow_pickle=False)
-        if isinstance(file, np.ndarray):
-            return of_array(file, f"{path}: ")
-        names = list(file.files)
+    with opened_arrays(path) as file:
+        if file.alone is not None:
+            return of_array(file.alone, f"{path}: ")
+        names = list(file.names)
         if {"format", "shape", "data"} <= set(names):
-            from scipy.sparse import load_npz
-
-            return of_array(load_npz(path).tocsr(), f"{path}: ")
+            return of_array(_sparse(path, {name: file[name] for name in names}), f"{path}: ")
         if key is None and len(names) > 1 and not {"x", "X"} & set(names):
             columns = {name: file[name] for name in names}
             if all(column.ndim == 1 for column in columns.values()) and len({*map(len, columns.values())}) == 1:
                 return of_frame(pa.table({name: pa.array(column) for name, column in columns.items()}))
         return of_array(file[_chosen(names, key, path)], f"{path}: ")
+
+
+def _sparse(path: Path, parts: dict[str, Any]) -> Any:
+    """A matrix of SciPy; ``parts`` have been read once, so that none is larger than the file."""
+    from scipy.sparse import load_npz
+
+    if parts["shape"].shape != (2,):
+        raise UserError(f"{path}: a sparse array of shape {parts['shape'].tolist()}: expected rows and columns.")
+    found = load_npz(path)
+    if hasattr(found, "check_format"):
+        found.check_format(full_check=True)  # SciPy's loops write where indices say, whatever they are
+    return found.tocsr()
 
 
 def _chosen(names: list[str], key: str | None, path: Path) -> str:

@@ -15,7 +15,8 @@ from memcomp_lightning.data.rows import UNLABELLED, Rows
 from memcomp_lightning.data.schema import Columns
 from memcomp_lightning.data.tables.cells import CellError, Cells
 from memcomp_lightning.data.tables.columns import Category, Column, Real, column_of
-from memcomp_lightning.errors import UserError
+from memcomp_lightning.errors import SettingError, UserError, require
+from memcomp_lightning.files import made_of
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Spin, Units, side_by_side
 
 
@@ -177,12 +178,14 @@ class TableSchema:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "TableSchema":
         """The schema that was written."""
-        label = content["label"]
-        found = None if label is None else column_of(label)
-        assert found is None or isinstance(found, Category)
-        columns = tuple(column_of(column) for column in content["columns"])
-        rest = (content.get(name) for name in ("key", "width"))
-        return cls(columns, found, content["weight"], content["named"], *rest)
+        plain = made_of(_Plain, dict(content))
+        columns = tuple(column_of(column) for column in plain.columns)
+        label = None if plain.label is None else column_of(plain.label)
+        names = [column.name for column in columns]
+        require(0 < len(names) == len(set(names)), "columns of a schema", names, "one or more, each once")
+        if not (label is None or isinstance(label, Category)):
+            raise SettingError(f"kind of the label = {label.kind!r} is not allowed: expected 'category'.")
+        return cls(columns, label, plain.weight, plain.named, plain.key, plain.width)
 
     def _labels(self, batch: Any, names: set[str], file: str, first_row: int) -> NDArray[np.int64]:
         if self.label is None or self.label.name not in names:
@@ -214,6 +217,19 @@ class TableSchema:
         if wrong.any():
             _refuse(self.weight, batch, int(wrong.argmax()), file, first_row, "a number > 0")
         return found.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """A schema as it is written."""
+
+    data: str
+    named: bool
+    label: dict[str, Any] | None
+    weight: str | None
+    columns: list[dict[str, Any]]
+    key: str | None = None
+    width: int | None = None
 
 
 def _read(column: Column, batch: Any, file: str, first_row: int) -> NDArray[np.float32]:

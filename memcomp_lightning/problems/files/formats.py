@@ -68,6 +68,8 @@ def guess(source: Source) -> str | None:
     if closed and (begun_by_c or any(len(row) > 3 or row[0] == "h" for row in rows)):
         if len(rows) == 1 and len(first) == 2:
             raise _several(source, lines, "an empty clause or a graph without edges", ("wcnf", "gset"))
+        if all(len(row) == 3 and row[0] != "h" for row in rows) and any("#" in line for line in lines):
+            raise _several(source, lines, "a clause or an entry", ("wcnf", "coo"))
         return "wcnf"
     if len(first) == 3 and all(map(NUMBER.fullmatch, first)):
         if not any("vartype" in line.lower() for line in lines if "#" in line) and _may_be_header(lines, first):

@@ -34,10 +34,11 @@ def parse(source: Source, maximise: bool) -> Parsed:
         if pattern:
             raise source.fault("an array of pattern", "coordinates of a pattern", 1)
         table = Table.read(source, lines, at, (1,))
-        j, i = np.triu_indices(n) if symmetric else np.indices((n, n)).reshape(2, -1)
-        n_entries = len(i)
+        n_entries = n * (n + 1) // 2 if symmetric else n * n
     if len(table.values) != n_entries:
         raise source.fault(f"{len(table.values)} entries", f"{n_entries}, as line {at} says")
+    if not coordinate:
+        j, i = np.triu_indices(n) if symmetric else np.indices((n, n)).reshape(2, -1)
     factors, remarks = np.ones(len(i) + 1, np.int64), unread(lines[1:])
     if symmetric:
         if coordinate:

@@ -33,6 +33,8 @@ def number(word: str) -> Exact:
     """The number that a word means; :func:`fits` says whether there is one."""
     if word.isdecimal():
         return int(word)
+    if float(word) == 0:  # whatever its power of ten, which may be huge
+        return 0
     return whole_if_so(Fraction(word))
 
 
@@ -111,7 +113,8 @@ def _digits_and_power(word: str) -> tuple[int, int]:
     """A number as an integer times a power of ten."""
     mantissa, _, power = word.lower().partition("e")
     whole, _, fraction = mantissa.partition(".")
-    return int(whole + fraction), int(power or 0) - len(fraction)
+    digits = int(whole + fraction)
+    return (digits, int(power or 0) - len(fraction)) if digits else (0, 0)
 
 
 def _decimals(denominator: int) -> int:

@@ -1,11 +1,10 @@
 """An RBM as numpy arrays in an ``.npz`` archive."""
 
 import io
-import zipfile
-import zlib
 
 import numpy as np
 
+from memcomp_lightning.array_files import ArrayFileError, opened_arrays
 from memcomp_lightning.arrays import as_array
 from memcomp_lightning.problems.files.objective import Objective, Parsed, RbmEnergy
 from memcomp_lightning.problems.files.source import Source
@@ -16,12 +15,13 @@ from memcomp_lightning.problems.graph import Bipartite
 def parse(source: Source, maximise: bool) -> Parsed:
     """Arrays ``weight (n_hidden, n_visible)``, ``b (n_visible,)`` and ``c (n_hidden,)``; x = (v, h)."""
     try:
-        with np.load(io.BytesIO(source.data), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ("weight", "b", "c") if name in archive.files}
-            names = ", ".join(map(repr, archive.files)) or "no arrays"
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        cause = str(error).partition("\n")[0]
-        raise source.fault(f"no readable arrays ({cause})", "an .npz archive of numpy.savez") from error
+        with opened_arrays(io.BytesIO(source.data)) as found:
+            arrays = {name: found[name] for name in ("weight", "b", "c") if name in found.names}
+            names = ", ".join(map(repr, found.names)) or "no arrays"
+            if found.alone is not None:
+                raise source.fault("an array alone", "an .npz archive of numpy.savez")
+    except ArrayFileError as error:
+        raise source.fault(f"no readable arrays ({error})", "an .npz archive of numpy.savez") from error
     if len(arrays) < 3:
         raise source.fault(names, "the arrays 'weight', 'b' and 'c'")
     for name, array in arrays.items():

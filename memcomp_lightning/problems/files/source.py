@@ -11,14 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from memcomp_lightning.errors import Told
+
 MOST_VARIABLES = 10**7
 """A larger number of variables is taken for a misprint: the list of their values alone would fill the memory."""
 
 MOST_UNPACKED = 2**30
 """Bytes. A small packed file may hold more than any memory does."""
 
+_MOST_FOLD, _ALWAYS_READ = 1000, 2**26
+"""What a packed file may hold: so many times its own bytes, as gzip gives at most, or so many bytes."""
 
-class ProblemFileError(ValueError):
+
+class ProblemFileError(Told, ValueError):
     """A problem file that cannot be read: where the fault is, what was found, what was expected."""
 
 
@@ -42,11 +47,15 @@ class Source:
         """
         if b"\0" in self.data[:4096]:
             raise self.fault("binary data", "a text file")
-        text = self.data.removeprefix(b"\xef\xbb\xbf").decode("ascii", "replace")
+        text = self.data.removeprefix(b"\xef\xbb\xbf").decode("ascii", "replace").translate(_NO_BLANKS)
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
         if not any(line and not line.isspace() for line in lines):
             raise self.fault("an empty file", "a problem")
         return lines
+
+
+_NO_BLANKS = dict.fromkeys(range(0x1C, 0x20), "\N{REPLACEMENT CHARACTER}")
+"""Signs that Python takes for blanks and no format has: they are no text."""
 
 
 class Packing(NamedTuple):
@@ -75,18 +84,27 @@ def unpacked(path: Path, data: bytes) -> bytes:
     packing = named or next((row for row in PACKINGS.values() if data.startswith(row.magic)), None)
     if packing is None:
         return data
+    most = min(MOST_UNPACKED, max(_ALWAYS_READ, _MOST_FOLD * len(data)))
     try:
         with packing.open(io.BytesIO(data)) as file:
-            content = file.read(MOST_UNPACKED + 1)
+            content = _read_at_most(file, most + 1)
     except (EOFError, OSError, zlib.error, lzma.LZMAError) as error:
         cause = str(error) or "an error"
         raise ProblemFileError(f"{path}: found {cause}, expected a complete {packing.name} stream.") from error
-    if len(content) > MOST_UNPACKED:
+    if len(content) > most:
         raise ProblemFileError(
-            f"{path}: found more than {MOST_UNPACKED // 2**30} GiB packed into it, expected at most so much. "
+            f"{path}: found more than {most // 2**20:,} MiB packed into it, expected at most so much. "
             "Unpack the file yourself if it is what you mean."
         )
     return content
+
+
+def _read_at_most(file: io.BufferedIOBase, n: int) -> bytes:
+    """The first n bytes, without room for all of them before they are there."""
+    content = bytearray()
+    while len(content) < n and (block := file.read(min(n - len(content), 2**20))):
+        content += block
+    return bytes(content)
 
 
 def stem(path: Path) -> Path:

@@ -23,6 +23,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
+from memcomp_lightning.array_files import opened_arrays
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.interop.parameters import rbm_of, tensor_of
 from memcomp_lightning.studies.accuracy import Progress
@@ -138,7 +139,7 @@ class PeerTrial(Named):
 
     def _judged(self, weights: Path) -> dict[str, float]:
         """What an RBM says of the rows."""
-        with np.load(weights) as arrays:
+        with opened_arrays(weights) as arrays:
             weight, b, c = (tensor_of(arrays[name], name) for name in ("weight", "b", "c"))
         rbm = rbm_of(weight, b, c)
         train, valid, test = (read_rows(file) for file in self.files)

@@ -194,3 +194,43 @@ def test_two_columns_of_one_name(tmp_path: Path) -> None:
     parquet.write_table(pa.table(list(numbers().T), names=list("abab")), tmp_path / "a.parquet")
     refused(Table(path=str(tmp_path / "a.parquet")).load, "a.parquet: two columns have the name 'a'")
     refused(lambda: data_of(twice), "two columns have the name 'a'")
+
+
+def test_numbers_that_are_too_far_from_the_mean(tmp_path: Path) -> None:
+    """Single precision would make infinity of them."""
+    path, other = tmp_path / "a.csv", tmp_path / "b.csv"
+    path.write_text("a,b\n" + "".join(f"{1 + k * 1e-12},{k % 3}.5\n" for k in range(N)))
+    other.write_text("a,b\n1,0.5\n1e29,1.5\n")
+    schema = Table(path=str(path)).load().schema
+    refused(lambda: schema.read(other), "column 'a', row 2", "'1e29' is not allowed", "standard deviations")
+
+
+def test_whole_numbers_that_no_integer_holds_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "".join(f"{k}e20,{k % 3}.5\n" for k in (*range(N), 5)))
+    schema = Table(path=str(path)).load().schema
+    found = schema.decode(schema.read(path).v)["a"]
+    np.testing.assert_allclose(found, [k * 1e20 for k in (*range(N), 5)], rtol=1e-5, atol=1e14)
+
+
+def test_words_that_are_numbers_beyond_what_floats_tell_apart(tmp_path: Path) -> None:
+    """Of two keys one word would be made."""
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "".join(f"{9007199254740992 + k % 3},{k % 3}.5\n" for k in range(N)))
+    refused(Table(path=str(path), columns={"a": "category"}).load, "column 'a'", "2^53")
+
+
+def test_damaged_hdf5(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    hdf5(path, numbers())
+    content = bytearray(path.read_bytes())
+    for at in range(0, len(content), 16):
+        spoilt = content.copy()
+        spoilt[at] ^= 0xFF
+        path.write_bytes(spoilt)
+        said = ""
+        try:
+            Table(path=str(path)).load()
+        except UserError as error:
+            said = str(error)
+        assert said.isprintable()

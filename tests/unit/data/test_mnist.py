@@ -130,11 +130,17 @@ def test_idx_arrays_are_parsed(idx_bytes):
         (struct.pack(">II", 0x0D01, 1) + b"x", r"magic number 0x00000801 .*got 0x00000d01"),
         (struct.pack(">II", 0x0801, 3) + b"xx", r"expected 3 bytes .*\(3,\).*got 2"),
         (struct.pack(">II", 0x0801, 1) + b"xx", r"expected 1 bytes .*\(1,\).*got 2"),
+        (struct.pack(">II", 0x0801, 0), r"expected values, got the shape \(0,\)"),
     ],
 )
 def test_idx_errors(data, message):
     with pytest.raises(CorruptFileError, match=message):
         idx.parse(data, 1, "file")
+
+
+def test_an_idx_file_of_huge_axes_without_values():
+    with pytest.raises(CorruptFileError, match="expected values"):
+        idx.parse(struct.pack(">IIII", 0x0803, 0, 2**32 - 1, 2**32 - 1), 3, "file")
 
 
 @pytest.mark.needs_mnist

@@ -96,3 +96,16 @@ def test_curves_end_at_the_answer_and_begin_where_the_solution_says(tmp_path):
     ]
     curves = solve_table.curves(rows, {"g.txt": "10"}, tmp_path)
     assert curves == {"best": [[(0.1, 0.5), (0.2, 0.2), (0.5, 0.2)], [(0.5, 0.0)]]}
+
+
+@pytest.mark.parametrize(("name", "cell"), [("value", "x"), ("value", "1e999999999"), ("wall_time_s", "")])
+def test_a_table_whose_numbers_are_none_is_refused_by_row(tmp_path, name, cell):
+    solve_table.write_rows(tmp_path / "t.csv", [row(), row(seed="1") | {name: cell}])
+    with pytest.raises(UserError, match=f"row 2: {name} is '{cell}', expected a number"):
+        solve_table.read_rows(tmp_path / "t.csv")
+
+
+def test_a_best_known_value_of_a_billion_digits(tmp_path):
+    (tmp_path / "best.csv").write_text("name,value\na.coo,1e999999999\n")
+    with pytest.raises(UserError, match="line 2"):
+        solve_table.read_best_known(tmp_path / "best.csv")
