@@ -91,5 +91,6 @@ def _of_whole_rows(model: EnergyModel, known: Tensor, at: Tensor, states: Tensor
     """The same of any machine, whose rows are written out whole."""
     whole = known.unsqueeze(-2).repeat(1, len(states), 1)
     whole[..., at] = states
-    of_rows: Tensor = log_hidden_sum(model, whole.flatten(0, 1), max_units=MOST_HIDDEN)
-    return of_rows.unflatten(0, whole.shape[:2])
+    of_rows = log_hidden_sum(model, whole.flatten(0, 1), max_units=MOST_HIDDEN)
+    found: Tensor = of_rows.unflatten(0, whole.shape[:2])
+    return found
