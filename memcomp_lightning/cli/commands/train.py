@@ -18,7 +18,7 @@ from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import sweep
+from memcomp_lightning.cli import launched, sweep
 from memcomp_lightning.cli.arguments import CommandLine, read
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.continued import Written, to_trust, with_settings_of_run
@@ -81,9 +81,11 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     if study_of(config) is not None:
         allowed = "null: figures and comparisons train new networks"
         require(config["continue"] is None, "continue", config["continue"], allowed)
+        launched.check_alone("A figure or a comparison", "Start it once: its setting workers spreads it.")
         for study, part, own in _studies(config, overrides).values():
             study.check(part, own)
         return
+    launched.check_config(config)
     for name, logger in config.logger.items():
         writes_events = logger is not None and str(logger.get("_target_")).endswith("TensorBoardLogger")
         if writes_events and find_spec("tensorboard") is None:
@@ -93,6 +95,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     values = tried_values(config)
     n_passes = config.finetune.iterations
     require_count("finetune.iterations", n_passes, minimum=0)
+    if values:
+        launched.check_alone("choose", "Let one process choose, and give what it chose as a setting.")
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
     if values:
@@ -186,7 +190,7 @@ def main() -> None:
     """Check everything, train, and end with a table or a message."""
     _silence_lightning()
     try:
-        if "LOCAL_RANK" not in os.environ:
+        if "LOCAL_RANK" not in os.environ or launched.launched() is not None:
             line, written = _read(sys.argv[1:])
             with checking(None if written is None else written.check):
                 try:
@@ -228,7 +232,7 @@ def _read(arguments: list[str]) -> tuple[CommandLine, Written | None]:
             "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
             "processes. Give the jobs one by one, or use one device with a parallel launcher."
         )
-    return line, written
+    return launched.check_line(line), written
 
 
 def _silence_lightning() -> None:
