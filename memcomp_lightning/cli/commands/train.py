@@ -7,6 +7,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,6 +39,7 @@ from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.history import history_with
+from memcomp_lightning.runs.lock import InUseError
 from memcomp_lightning.runs.table import closing_lines, run_table, short_path
 from memcomp_lightning.training import DivergedError
 
@@ -65,13 +67,18 @@ def train(config: DictConfig) -> float | None:
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
-        return _train(config, folder, [*search_path(settings), *settings.overrides.task])
+        trains = _is_first_process() and folder.result is None
+        with folder.held() if trains else nullcontext():
+            return _train(config, folder, [*search_path(settings), *settings.overrides.task])
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(COMMAND, error)
         if not in_sweep:
             raise
-        folder.fail({"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()})
+        if not isinstance(error, InUseError):  # what is in the folder is the other's
+            folder.fail(
+                {"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()}
+            )
         log.error("Failed, the sweep goes on: %s", explain(error))
         return 0.0 if isinstance(error, DivergedError) else None
 
@@ -239,6 +246,8 @@ def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
+    # On every machine of a cluster, whose launchers do use it where it is meant to be used.
+    warnings.filterwarnings("ignore", message="The `srun` command is available on your system but is not used")
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 
