@@ -273,12 +273,12 @@ def attempt(case: str) -> ledger.Outcome:
                 return CASES[case](folder, environment)
             finally:
                 if "--keep" in sys.argv:
-                    shutil.copytree(place, "kept", dirs_exist_ok=True, ignore=shutil.ignore_patterns("socket*"))
+                    shutil.copytree(folder, "kept", dirs_exist_ok=True)
 
 
 def main() -> int:
     lines = ledger.parser(__doc__, count=len(CASES), what="cases")
-    lines.add_argument("--keep", action="store_true", help="copy folders and logs to ./kept")
+    lines.add_argument("--keep", action="store_true", help="copy the folders of the runs to ./kept")
     given = lines.parse_args()
     status = ledger.run(given.out, [*CASES][: given.count], attempt, workers=1)
     for line in ledger.read(given.out / "ledger.jsonl"):
