@@ -222,7 +222,7 @@ def cancelled(folder: Path, environment: Mapping[str, str]) -> ledger.Outcome:
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=HANGS_AFTER)
     said_first = err.strip().splitlines()[-1] if err.strip() else ""
-    if process.returncode != 130 or "Go on with: memcomp-train -m" not in said_first:
+    if process.returncode != 130 or "Go on with: memcomp-train --multirun" not in said_first:
         findings.append(f"the interrupted command ended with {process.returncode}: {err[-1500:]}")
     written = {path: path.stat().st_mtime_ns for path in sweep.finished()}
     process = sweep.start()
@@ -242,7 +242,16 @@ def started_by_srun(folder: Path, environment: Mapping[str, str]) -> ledger.Outc
 
     kind, findings = "two tasks of srun train one run", []
     run = [*JOB, "pretrain.iterations=20", "trainer.accelerator=cpu", "hydra.run.dir=run"]
-    command = ["srun", "-n", "2", "--cpus-per-task=1", sys.executable, "-m", "memcomp_lightning.cli.train", *run]
+    command = [
+        "srun",
+        "-N1",
+        "--ntasks-per-node=2",
+        "--cpus-per-task=1",
+        sys.executable,
+        "-m",
+        "memcomp_lightning.cli.train",
+        *run,
+    ]
     wrong = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     remedy = ["trainer.devices=2", "trainer.num_nodes=1", "trainer.strategy=ddp"]
     if wrong.returncode == 0 or f"Add {' '.join(remedy)}" not in wrong.stderr:
