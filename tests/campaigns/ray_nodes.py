@@ -74,8 +74,8 @@ def node_dies(place: Path) -> ledger.Outcome:
     try:
         time.sleep(8)
         launcher = ["hydra/launcher=ray", f"hydra.launcher.ray.init.address=127.0.0.1:{PORT}"]
-        # Ray takes no size of its store from who joins a cluster.
-        launcher += ["~hydra.launcher.ray.init.object_store_memory", "hydra.sweep.dir=sweep"]
+        # The launcher gives the store a size, which Ray does not take from who joins a cluster.
+        launcher += ["+hydra.launcher.ray.init.object_store_memory=null", "hydra.sweep.dir=sweep"]
         seeds = f"seed={','.join(map(str, SEEDS))}"
         command = [sys.executable, "-m", "memcomp_lightning.cli.train", "-m", *JOB, seeds, *launcher]
         pipe = subprocess.PIPE
@@ -90,8 +90,9 @@ def node_dies(place: Path) -> ledger.Outcome:
         time.sleep(1)
         kill(second.pid)
         out, _ = sweep.communicate(timeout=HANGS_AFTER)
-        with (place / "sweep/table.csv").open() as file:
-            rows = [row["n_runs"] for row in csv.DictReader(file)]
+        table = place / "sweep/table.csv"
+        lines = table.read_text().splitlines() if table.exists() else []
+        rows = [row["n_runs"] for row in csv.DictReader(lines)]
         logs = [path.read_text() for path in (place / "sweep").glob("*/train.log")]
         went_on = sum("Going on from" in text for text in logs)
         if sweep.returncode != 0 or rows != [str(len(SEEDS))]:
