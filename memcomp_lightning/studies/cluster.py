@@ -48,7 +48,7 @@ def _unreachable(name: str, address: str, error: Exception) -> UserError:
 @contextmanager
 def _dask(distributed: Any, address: str) -> Iterator[Do[Any]]:
     try:
-        client = distributed.Client(address, set_as_default=False)
+        client = distributed.Client(address)
     except OSError as error:
         raise _unreachable("dask", address, error) from error
 

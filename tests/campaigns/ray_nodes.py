@@ -75,7 +75,7 @@ def node_dies(place: Path) -> ledger.Outcome:
         time.sleep(8)
         launcher = ["hydra/launcher=ray", f"hydra.launcher.ray.init.address=127.0.0.1:{PORT}"]
         # The launcher gives the store a size, which Ray does not take from who joins a cluster.
-        launcher += ["+hydra.launcher.ray.init.object_store_memory=null", "hydra.sweep.dir=sweep"]
+        launcher += ["+hydra.launcher.ray.init.object_store_memory=null", f"hydra.sweep.dir={place}/sweep"]
         seeds = f"seed={','.join(map(str, SEEDS))}"
         command = [sys.executable, "-m", "memcomp_lightning.cli.train", "-m", *JOB, seeds, *launcher]
         pipe = subprocess.PIPE

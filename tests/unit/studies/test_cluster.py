@@ -36,7 +36,7 @@ class Future:
 
 
 class Client:
-    def __init__(self, address: str, set_as_default: bool) -> None:
+    def __init__(self, address: str) -> None:
         if address == "nowhere":
             raise OSError("Timed out")
 
