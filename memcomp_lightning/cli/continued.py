@@ -10,7 +10,7 @@ from hydra import compose
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli.arguments import expanded, from_folder, parse, read, unquoted
-from memcomp_lightning.cli.overrides import with_search_path
+from memcomp_lightning.cli.overrides import check_is_folder, with_search_path
 from memcomp_lightning.configuration.composition import SEARCH_PATH, search_paths
 from memcomp_lightning.configuration.continued import finished
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS
@@ -159,7 +159,10 @@ def _named(setting: str, arguments: Sequence[str]) -> str | None:
         raise UserError(
             f"{setting}= names no folder: write {setting}=FOLDER, the folder of a run of memcomp-train."
         )
-    return unquoted(names[-1]) if names else None
+    if not names:
+        return None
+    check_is_folder(setting, unquoted(names[-1]))
+    return unquoted(names[-1])
 
 
 def _resumed(name: str, arguments: Sequence[str], trusted: Collection[str]) -> tuple[list[str], Written]:

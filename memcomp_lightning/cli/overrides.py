@@ -86,6 +86,7 @@ def check_command_line(
         overrides = with_search_path(overrides, line.config_dir)
     key = "hydra.sweep.dir" if line.multirun else "hydra.run.dir"
     if not line.shows:
+        check_is_folder(key, line.value(key))
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
     folder: str | None = None
     with composing():
@@ -312,6 +313,16 @@ def with_search_path(overrides: Sequence[str], folder: Path | None) -> list[str]
     assert isinstance(others, list)
     places = [f"file://{folder}", *map(str, others)]
     return [f"{SEARCH_PATH}{places}", *(o for o in overrides if o not in given)]
+
+
+def check_is_folder(name: str, value: str | None) -> None:
+    """Raise a UserError for the address of an object store, which would become a folder of that name."""
+    if value is not None and re.match(r"\w[\w+.-]*://", value):
+        remedy = f"mount the store, or train in a folder and copy it: {name}=runs/mine"
+        raise UserError(
+            f"{name} = {value} is not allowed: expected a folder of a file system. A run renames and links files, "
+            f"which object stores cannot do: {remedy}"
+        )
 
 
 def _check_writable(folder: Path, key: str) -> None:

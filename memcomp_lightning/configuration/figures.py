@@ -50,7 +50,7 @@ class Figure:
     claims: list[Claim]
     curves: dict[str, Curve]
     networks: int | None = None
-    workers: int | None = None
+    workers: int | str | None = None
     choice: str | None = None
 
     def __post_init__(self) -> None:

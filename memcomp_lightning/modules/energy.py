@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import lightning.pytorch as pl
 import torch
+import torch.distributed
 from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor, nn
 from torch.nn import Parameter
@@ -320,7 +321,7 @@ class EnergyPretraining(StageModule):
         gap_so_far = self._gap + batch.share * gap.detach()
         if batch.closes_step:
             model.project()
-            self.energy_gaps[layer] = step.processes.mean(gap_so_far)
+            (self.energy_gaps[layer],) = step.processes.means([gap_so_far])
             self._state, self._gap = state.after_update(), 0.0
         else:
             self._state, self._gap = state, gap_so_far
@@ -386,8 +387,12 @@ class _OfTrainer(Processes):
     def __init__(self, trainer: pl.Trainer, device: torch.device) -> None:
         self._trainer, self._device = trainer, device
 
-    def mean(self, value: Tensor) -> Tensor:
-        return cast(Tensor, self._trainer.strategy.reduce(value, reduce_op="mean"))
+    def means(self, values: Sequence[Tensor]) -> Sequence[Tensor]:
+        """All of them in one message; Lightning would send each by itself, with a barrier before it."""
+        together = torch.cat([value.reshape(-1) for value in values])
+        torch.distributed.all_reduce(together)
+        parts = (together / self._trainer.world_size).split([value.numel() for value in values])
+        return [part.view_as(value) for part, value in zip(parts, values, strict=True)]
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
         """Call ``make`` in the process of rank 0 alone, and return its result in all of them."""

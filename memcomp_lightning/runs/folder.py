@@ -4,7 +4,8 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -18,6 +19,7 @@ import memcomp_lightning
 from memcomp_lightning import __version__
 from memcomp_lightning.errors import UserError, lost
 from memcomp_lightning.files import read_json, write_json, write_text
+from memcomp_lightning.runs import lock
 from memcomp_lightning.runs.paths import is_path
 
 
@@ -105,6 +107,19 @@ class RunFolder:
         """The folder in which the run was started: relative paths in its overrides start there."""
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes out; a UserError if one is in, or the folder cannot be written."""
+        with ExitStack() as stack:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(lock.held(self.path))
+            except OSError as error:
+                if lost(error) is not None:
+                    raise
+                raise self._not_written(error) from error
+            yield
+
     def open(self, config: DictConfig, overrides: Sequence[str]) -> None:
         """Make the folder; a UserError if it may not be written, or was made with other settings."""
         try:
@@ -117,10 +132,11 @@ class RunFolder:
         except OSError as error:
             if lost(error) is not None:  # another folder would not help
                 raise
-            raise UserError(
-                f"run folder {self.path} cannot be written ({error.strerror}): choose another with "
-                "hydra.run.dir=PATH"
-            ) from error
+            raise self._not_written(error) from error
+
+    def _not_written(self, error: OSError) -> UserError:
+        remedy = "choose another with hydra.run.dir=PATH"
+        return UserError(f"run folder {self.path} cannot be written ({error.strerror}): {remedy}")
 
     def check_source(self) -> None:
         """Note which code makes the results of this folder; a UserError if other code made what is there."""

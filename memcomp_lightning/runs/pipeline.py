@@ -23,6 +23,7 @@ from memcomp_lightning.modules.trainers import tries
 from memcomp_lightning.modules.weights import check_checkpoint, write_tensors
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.history import passes_of, seen_before, short, total_passes
+from memcomp_lightning.runs.lost import Others
 from memcomp_lightning.runs.table import final_log_likelihoods
 from memcomp_lightning.studies.plan import Plan, Stage
 from memcomp_lightning.training import evaluate
@@ -138,6 +139,8 @@ def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:
         check_checkpoint(stage.module, path)
         resume_from = path
         log.info("Going on from %s", path)
+    others = Others()
+    trainer.callbacks.append(others)  # type: ignore[attr-defined]
     try:
         trainer.fit(stage.module, datamodule=stage.data, ckpt_path=resume_from, weights_only=True)
     except (NotTrainedError, TrainingSpikeException) as error:
@@ -145,6 +148,12 @@ def _fit(stage: Stage, trainer: pl.Trainer, folder: RunFolder) -> pl.Trainer:
     except MisconfigurationException as error:
         raise UserError(f"{stage.module.stage}: {error}") from error
     except RuntimeError as error:
+        if (lost := others.lost(error)) is not None:
+            reason = str(error).partition("\n")[0].partition(" This is typically")[0]
+            raise UserError(
+                f"{stage.module.progress}: {lost}. Start the same command again in every process, with "
+                f"hydra.run.dir={folder.path}: it goes on from the last checkpoint. ({reason})"
+            ) from error
         if not str(error).startswith("Early stopping conditioned on metric"):
             raise
         raise UserError(f"callbacks.{stage.module.stage}: {error}") from error

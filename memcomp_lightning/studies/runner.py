@@ -11,9 +11,10 @@ import torch
 from tqdm import tqdm
 
 from memcomp_lightning.compiling import told
-from memcomp_lightning.errors import require_count
+from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.processes import processes, say
 from memcomp_lightning.studies.accuracy import Progress, device_of
+from memcomp_lightning.studies.cluster import CLUSTERS, cluster
 from memcomp_lightning.studies.records import Record, Records
 
 
@@ -39,14 +40,18 @@ Do = Callable[[Sequence[Work]], Iterator[list[Record]]]
 
 
 @contextmanager
-def runner(name: str, *, workers: int | None = 1, accelerator: str = "cpu") -> Iterator[Run]:
+def runner(name: str, *, workers: int | str | None = 1, accelerator: str = "cpu") -> Iterator[Run]:
     """Yield a function that trains the trials of a study, here or in several processes of one thread.
 
-    ``workers`` None is one for each core, one in all where the trainer's setting of the accelerator is a GPU.
+    ``workers`` None is one for each core, one in all where the trainer's setting of the accelerator is a GPU;
+    ``"dask"`` and ``"ray"`` are those of a cluster.
     """
     if workers is None:
         workers = 1 if device_of(accelerator).type != "cpu" else _n_cores()
-    require_count("workers", workers)
+    elsewhere = workers in CLUSTERS
+    if not elsewhere:
+        require(not isinstance(workers, str), "workers", workers, f"an integer >= 1, {' or '.join(CLUSTERS)}")
+        require_count("workers", workers)
     with tqdm(desc=name, total=0, unit="update", unit_scale=True) as bar:
 
         def show(what: str, n_updates: int) -> None:
@@ -60,16 +65,34 @@ def runner(name: str, *, workers: int | None = 1, accelerator: str = "cpu") -> I
             for found in do(work):
                 records.append(found)
 
+        if elsewhere:
+            with cluster(str(workers)) as send:
+                yield partial(run, lambda work: _heard(send(_run_elsewhere, work), show))
+            return
         if workers == 1:
             yield partial(run, lambda work: (one.run(show) for one in work))
             return
-        with processes(workers, show) as do:
+        with processes(int(workers), show) as do:
             yield partial(run, partial(do, _run_in_worker))
 
 
 def _n_cores() -> int:
     """Those that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _heard(
+    found: Iterator[tuple[str, int, list[Record]]], show: Callable[[str, int], None]
+) -> Iterator[list[Record]]:
+    """Show work that was done on other machines as it is done."""
+    for title, n_updates, records in found:
+        show(title, n_updates)
+        yield records
+
+
+def _run_elsewhere(work: Work) -> tuple[str, int, list[Record]]:
+    torch.set_num_threads(1)
+    return work.title, work.n_updates, work.run(lambda what, n_updates: None)
 
 
 def _run_in_worker(work: Work) -> list[Record]:

@@ -67,7 +67,7 @@ class Comparison:
     methods: dict[str, Method]
     claimed: list[str]
     baselines: list[str]
-    workers: int | None
+    workers: int | str | None
 
     def __post_init__(self) -> None:
         for key in ("replicas", "choosing", "points", "gradient_draws"):

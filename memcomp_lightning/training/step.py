@@ -20,9 +20,9 @@ Sampler: TypeAlias = NegativePhaseSampler[Any, Any]
 class Processes:
     """The processes that share an update, each with images of its own: here one, alone."""
 
-    def mean(self, value: Tensor) -> Tensor:
-        """The mean over all of them."""
-        return value
+    def means(self, values: Sequence[Tensor]) -> Sequence[Tensor]:
+        """The mean of each value over all of them."""
+        return values
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
         """What the first one makes, in all of them."""
@@ -123,7 +123,7 @@ class EnergyStep:
         """The negative phase for a batch, and the state after it."""
         offsets, negative = state.offsets, state.negative
         if negative is None and self.centring is not None:
-            offsets = Offsets(*map(self.processes.mean, self.centring.follow(offsets, positive)))
+            offsets = Offsets(*self.processes.means(self.centring.follow(offsets, positive)))
         if negative is None or self.sampler.uses_data:
             negative = self._negative_phase(model, positive, state.sampler, generator)
         return negative, StepState(negative.state, offsets, negative)

@@ -279,3 +279,15 @@ def test_a_missing_package_names_the_extra_to_install(memcomp_train: Run, monkey
     outcome = memcomp_train("sampler=annealer")
     assert outcome.status == 2
     assert "pip install 'memcomp-lightning[dimod]'" in outcome.err
+
+
+@pytest.mark.parametrize(
+    "argument",
+    ["hydra.run.dir=s3://bucket/run", "hydra.run.dir=memory://run", "resume=gs://run", "continue=file:///run"],
+)
+def test_addresses_of_object_stores_are_no_folders(memcomp_train: Run, argument: str) -> None:
+    outcome = memcomp_train("sampler=cd", argument)
+    name, _, value = argument.partition("=")
+    assert outcome.status == 2
+    assert f"{name} = {value} is not allowed: expected a folder of a file system." in outcome.err
+    assert list(Path().iterdir()) == []

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from running import FAST, Outcome
 
 from memcomp_lightning.runs import pipeline
+from memcomp_lightning.runs.lock import held
 
 Run = Callable[..., Outcome]
 SWEEP = ["-m", "sampler=cd,pcd", "seed=0,1,2", *FAST, "hydra.sweep.dir=sweep"]
@@ -100,3 +102,23 @@ def test_joblib_launcher_gives_the_same_results(memcomp_train: Run, joblib_launc
     for row, other in zip(rows("sweep/table.csv"), rows("parallel/table.csv"), strict=True):
         assert row["test_accuracy_mean"] == other["test_accuracy_mean"]
         assert row["energy_gap_mean"] == other["energy_gap_mean"]
+
+
+def test_a_folder_in_use_is_left_to_the_other_process(memcomp_train: Run) -> None:
+    Path("run").mkdir()
+    with held(Path("run")):
+        outcome = memcomp_train("sampler=cd", *FAST, "hydra.run.dir=run")
+    assert outcome.status == 2
+    assert f"run is in use by process {os.getpid()} on" in outcome.err
+    assert not list(Path("run").glob("*.json"))
+    sweep = ["-m", "sampler=cd", "seed=0,1", *FAST, "hydra.sweep.dir=sweep"]
+    assert memcomp_train(*sweep).status == 0
+    job = next(Path("sweep").glob("*seed=1*"))
+    (job / "result.json").unlink()
+    with held(job):
+        outcome = memcomp_train(*sweep)
+    assert outcome.status == 1
+    assert "did not finish" in outcome.out
+    assert not (job / "error.json").exists()
+    assert memcomp_train(*sweep).status == 0
+    assert not list(Path("sweep").rglob(".lock*"))

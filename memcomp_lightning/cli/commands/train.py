@@ -7,7 +7,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +19,7 @@ from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
 from omegaconf import DictConfig
 
-from memcomp_lightning.cli import sweep
+from memcomp_lightning.cli import launched, sweep
 from memcomp_lightning.cli.arguments import CommandLine, read
 from memcomp_lightning.cli.commands import report
 from memcomp_lightning.cli.continued import Written, to_trust, with_settings_of_run
@@ -39,6 +39,7 @@ from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.history import history_with
+from memcomp_lightning.runs.lock import InUseError
 from memcomp_lightning.runs.table import closing_lines, run_table, short_path
 from memcomp_lightning.training import DivergedError
 
@@ -66,15 +67,18 @@ def train(config: DictConfig) -> float | None:
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
-        return _train(config, folder, [*search_path(settings), *settings.overrides.task])
+        trains = _is_first_process() and folder.result is None
+        with folder.held() if trains else nullcontext():
+            return _train(config, folder, [*search_path(settings), *settings.overrides.task])
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(COMMAND, error)
         if not in_sweep:
             raise
         record = {"error": f"{type(error).__name__}: {explain(error)}", "traceback": traceback.format_exc()}
-        with suppress(OSError):  # which may be what it failed by
-            folder.fail(record)
+        if not isinstance(error, InUseError):  # what is in the folder is the other's
+            with suppress(OSError):  # which may be what it failed by
+                folder.fail(record)
         log.error("Failed, the sweep goes on: %s", explain(error))
         return 0.0 if isinstance(error, DivergedError) else None
 
@@ -84,9 +88,11 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     if study_of(config) is not None:
         allowed = "null: figures and comparisons train new networks"
         require(config["continue"] is None, "continue", config["continue"], allowed)
+        launched.check_alone("A figure or a comparison", "Start it once: its setting workers spreads it.")
         for study, part, own in _studies(config, overrides).values():
             study.check(part, own)
         return
+    launched.check_config(config)
     for name, logger in config.logger.items():
         writes_events = logger is not None and str(logger.get("_target_")).endswith("TensorBoardLogger")
         if writes_events and find_spec("tensorboard") is None:
@@ -96,6 +102,8 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     values = tried_values(config)
     n_passes = config.finetune.iterations
     require_count("finetune.iterations", n_passes, minimum=0)
+    if values:
+        launched.check_alone("choose", "Let one process choose, and give what it chose as a setting.")
     require(n_passes > 0 or not values, "finetune.iterations", n_passes, "an integer >= 1 where choose is set")
     plans = [build(own) for own in [for_trial(config, value) for value in values] or [config]]
     if values:
@@ -203,7 +211,7 @@ def main() -> None:
     """Check everything, train, and end with a table or a message."""
     _silence_lightning()
     try:
-        if "LOCAL_RANK" not in os.environ:
+        if "LOCAL_RANK" not in os.environ or launched.launched() is not None:
             line, written = _read(sys.argv[1:])
             with checking(None if written is None else written.check):
                 try:
@@ -252,14 +260,15 @@ def _read(arguments: list[str]) -> tuple[CommandLine, Written | None]:
             "trainer.devices > 1 in a multirun: each job would start the whole sweep again in its other "
             "processes. Give the jobs one by one, or use one device with a parallel launcher."
         )
-    return line, written
+    return launched.check_line(line), written
 
 
 def _silence_lightning() -> None:
     """Keep Lightning's remarks on hardware and tips, and a deprecation inside it, from the user's screen."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
-    warnings.filterwarnings("ignore", message="The `srun` command is available")  # on each node of Slurm
+    # On every machine of a cluster, whose launchers do use it where it is meant to be used.
+    warnings.filterwarnings("ignore", message="The `srun` command is available on your system but is not used")
     warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")  # a resumed run
 
 

@@ -48,7 +48,7 @@ class Density:
     baselines: list[str]
     peers: str | None
     peers_python: str | None
-    workers: int | None
+    workers: int | str | None
 
     def __post_init__(self) -> None:
         for name in ("replicas", "peer_replicas", "points", "patience", "quick_betas", "betas"):

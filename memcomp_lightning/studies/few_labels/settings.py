@@ -95,7 +95,7 @@ class FewLabels:
     claims: list[Claim]
     candidates: list[str]
     worth: list[str]
-    workers: int | None
+    workers: int | str | None
 
     def __post_init__(self) -> None:
         for name in ("draws", "draws_of_all", "pretrainings", "many", "updates", "passes", "measured"):
