@@ -29,6 +29,9 @@ BEAT_S = 10.0
 PATIENCE_S = 60.0
 """Seconds without a touch after which a process on another machine counts as ended."""
 
+_held_here: set[Path] = set()
+"""Locks that this process holds; one that it could not take away, as its folder had vanished, it holds no more."""
+
 log = logging.getLogger(__name__)
 
 
@@ -50,9 +53,11 @@ def held(folder: Path) -> Iterator[None]:
     ended = threading.Event()
     beat = threading.Thread(target=_beat, args=(path, own, ended), daemon=True)
     beat.start()
+    _held_here.add(path.absolute())
     try:
         yield
     finally:
+        _held_here.discard(path.absolute())
         ended.set()
         beat.join()
         with suppress(OSError):
@@ -126,7 +131,7 @@ def _free_or_raise(path: Path) -> None:
     if holder is None:
         return
     here = holder.get("host") == socket.gethostname() and holder.get("machine") == _machine()
-    if _lives_here(holder) if here else _touched(path, holder):
+    if _lives_here(path, holder) if here else _touched(path, holder):
         raise InUseError(_refusal(path, holder))
     if _holder(path) != holder:
         return
@@ -134,9 +139,11 @@ def _free_or_raise(path: Path) -> None:
     _take_away(path, holder)
 
 
-def _lives_here(holder: dict[str, Any]) -> bool:
+def _lives_here(path: Path, holder: dict[str, Any]) -> bool:
     pid = holder.get("pid")
     if not isinstance(pid, int):
+        return False
+    if pid == os.getpid() and path.absolute() not in _held_here:
         return False
     try:
         os.kill(pid, 0)
