@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import shlex
+import signal
 import socket
 import threading
 import time
@@ -193,9 +194,18 @@ def _beat(path: Path, own: dict[str, Any], ended: threading.Event) -> None:
         with suppress(OSError):
             if _holder(path) not in (own, None):
                 log.error("%s was taken by another process: this one ends.", path.parent)
-                _thread.interrupt_main()
+                _interrupt()
                 return
             os.utime(path)
+
+
+def _interrupt() -> None:
+    """As Ctrl-C does; ``interrupt_main`` alone would let a main thread that waits go on waiting."""
+    main = threading.main_thread().ident
+    if main is None or not hasattr(signal, "pthread_kill"):
+        _thread.interrupt_main()
+    else:
+        signal.pthread_kill(main, signal.SIGINT)
 
 
 def _named(holder: dict[str, Any]) -> str:

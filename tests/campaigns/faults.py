@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import ledger
-from commands import KINDS, Ended, Kind, difference, leftovers, live, send, typed
 from kills import whole
+from kinds_of_run import KINDS, Ended, Kind, difference, leftovers, live, send, typed
 from ledger import Outcome
 
 PAGE = 4096

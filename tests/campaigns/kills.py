@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 
 import ledger
-from commands import KINDS, Ended, Kind, difference, leftovers, live, typed
+from kinds_of_run import KINDS, Ended, Kind, difference, leftovers, live, typed
 from ledger import Outcome
 
 MOST_KILLS = 4

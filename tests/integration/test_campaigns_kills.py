@@ -12,10 +12,10 @@ import torch
 pytest.importorskip("pyarrow")
 sys.path.append(str(Path(__file__).parents[1] / "campaigns"))
 
-import commands
 import faults
 import kills
-from commands import KINDS
+import kinds_of_run
+from kinds_of_run import KINDS
 
 pytestmark = pytest.mark.xdist_group("campaigns")  # one worker, one uninterrupted run of each kind
 
@@ -75,17 +75,19 @@ def test_what_differs_is_found(folder: Path, tmp_path: Path, name: str, told: st
     """By one bit of one weight, too."""
     place, _ = kills.whole(KINDS["machine"], folder)
     shutil.copytree(place / "second", tmp_path / "here")
-    assert commands.difference(tmp_path / "here", place / "first") is None
+    assert kinds_of_run.difference(tmp_path / "here", place / "first") is None
     damaged(tmp_path / "here/run", name)
-    assert told in (commands.difference(tmp_path / "here", place / "first") or "")
+    assert told in (kinds_of_run.difference(tmp_path / "here", place / "first") or "")
 
 
 def test_a_damaged_result_is_a_finding_with_kind_seed_and_moment(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    live, damage = commands.live, ["weights"]
+    live, damage = kinds_of_run.live, ["weights"]
 
-    def then_damaged(command: str, arguments: tuple[str, ...], here: Path, **settings: object) -> commands.Ended:
+    def then_damaged(
+        command: str, arguments: tuple[str, ...], here: Path, **settings: object
+    ) -> kinds_of_run.Ended:
         ended = live(command, arguments, here, **settings)  # type: ignore[arg-type]
         if ended.status == 0:
             damaged(here / "run", damage.pop())
@@ -102,15 +104,15 @@ def test_a_damaged_result_is_a_finding_with_kind_seed_and_moment(
 
 
 def test_a_command_that_does_not_go_on_is_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands.Kind, "goes_on", lambda *_: ("train", ("resume=nothing",)))
+    monkeypatch.setattr(kinds_of_run.Kind, "goes_on", lambda *_: ("train", ("resume=nothing",)))
     (finding,) = kills.attempt("machine/1", folder=folder).findings
     assert "refused to go on: memcomp-train resume=nothing ended with 2" in finding
 
 
 def test_a_message_without_its_command_is_found(tmp_path: Path) -> None:
-    place = commands.Ended(0, "", "", 1.0)
+    place = kinds_of_run.Ended(0, "", "", 1.0)
     case = faults.Case("memory", KINDS["machine"], faults.random.Random(0), tmp_path, place, tmp_path)
-    assert case.heard(commands.Ended(1, "", "Traceback\nMemoryError", 1.0))
+    assert case.heard(kinds_of_run.Ended(1, "", "Traceback\nMemoryError", 1.0))
     assert [finding.split(": ")[1] for finding in case.findings] == [
         "a traceback",
         "no command that goes on is named",

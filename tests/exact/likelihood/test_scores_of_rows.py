@@ -18,8 +18,7 @@ from memcomp_lightning.data.tables import TableSchema
 from memcomp_lightning.data.tables.columns import Binary, Category, Real
 from memcomp_lightning.errors import SettingError, UserError
 from memcomp_lightning.likelihood import annealing_products, log_partition_function
-from memcomp_lightning.models import DBN, RBM
-from memcomp_lightning.models.observed import visible_units_coupled
+from memcomp_lightning.models import DBN, RBM, BoltzmannMachine
 from memcomp_lightning.models.units import Bernoulli, Spin
 from memcomp_lightning.testing import brute_force, small_machine, small_machines, small_rbm
 from memcomp_lightning.trained import Run, partition
@@ -172,11 +171,17 @@ def test_machines_have_scores_too(make: Any) -> None:
     exact = brute_force.log_likelihood(model.double(), model.visible.encode(v), masks).detach().numpy()
     of_rows = found.columns["log_likelihood"]
     assert of_rows[0] == pytest.approx(exact[0], abs=1e-5)
-    if visible_units_coupled(model):
-        assert np.isnan(of_rows[1])
-        assert "no likelihoods of rows with gaps" in found.notes[0]
-    else:
-        assert of_rows[1] == pytest.approx(exact[1], abs=1e-5)
+    assert of_rows[1] == pytest.approx(exact[1], abs=1e-5)
+
+
+def test_rows_of_a_potts_model_with_many_gaps_have_no_likelihood_and_are_counted() -> None:
+    model = BoltzmannMachine(n_visible=13, n_hidden=0)
+    v = torch.ones(3, 13)
+    observed = torch.ones_like(v, dtype=torch.bool)
+    observed[1, :11] = observed[2, :10] = False
+    found = score(run_of(model, ImageSchema(PixelLayout(1, 13), 0)), Rows(v, torch.full((3,), -1), observed))
+    assert np.isnan(found.columns["log_likelihood"]).tolist() == [False, True, False]
+    assert any(note.startswith("1 rows with gaps have no likelihood: more than 1,024") for note in found.notes)
 
 
 def only_first(value: float) -> Rows:
