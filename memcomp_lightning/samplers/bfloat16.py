@@ -55,7 +55,7 @@ class InBfloat16:
         remedy = "Take pretrain.products=float32."
         place = model.b.device.type
         require(place == "cpu", "device of a model with products in bf16", place, "cpu", remedy)
-        allowed = "a processor that multiplies in bfloat16 (AVX512-BF16, AMX)"
+        allowed = "a processor on which torch multiplies float32 in bfloat16, as with AMX"
         require(multiplies_in_bfloat16(), "processor for products in bf16", "this one", allowed, remedy)
         return self.sampler.init(model, n_chains, generator=generator)
 
@@ -69,12 +69,17 @@ class InBfloat16:
 
 @cache
 def multiplies_in_bfloat16() -> bool:
-    """Whether the processor has instructions for it, and torch uses them."""
-    from llvmlite.binding import get_host_cpu_features
+    """Whether torch does so on this processor, found by a product: instructions for it may lie unused."""
+    if not torch.backends.mkldnn.is_available():
+        return False
+    finer_than_bfloat16 = torch.full((_TRIED, _TRIED), 1 + 2.0**-12, dtype=torch.float32, device="cpu")
+    one = torch.eye(_TRIED, dtype=torch.float32, device="cpu")
+    with _rounded_products():
+        return not (finer_than_bfloat16 @ one).equal(finer_than_bfloat16)
 
-    found = get_host_cpu_features()
-    has = bool(found.get("avx512bf16")) or bool(found.get("amx-bf16"))
-    return has and torch.backends.mkldnn.is_available()
+
+_TRIED = 256
+"""Rows and columns; torch may leave small products as they are."""
 
 
 @contextmanager

@@ -60,5 +60,18 @@ def test_states_whose_energies_are_compared_are_refused():
 
 def test_a_processor_without_it_is_refused(monkeypatch):
     monkeypatch.setattr(bfloat16, "multiplies_in_bfloat16", lambda: False)
-    with pytest.raises(SettingError, match=r"AVX512-BF16.*pretrain\.products=float32"):
+    with pytest.raises(SettingError, match=r"in bfloat16, as with AMX.*pretrain\.products=float32"):
         sampled(InBfloat16(sampler=CD()), small_rbm())
+
+
+@pytest.mark.parametrize("rounds", [True, False])
+def test_a_product_tells_whether_torch_rounds(monkeypatch, rounds):
+    multiply = torch.Tensor.__matmul__
+
+    def rounded(a, b):
+        return multiply(a.bfloat16().float(), b) if precision() == "bf16" and rounds else multiply(a, b)
+
+    monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: True)
+    found = bfloat16.multiplies_in_bfloat16.__wrapped__()
+    assert found or not rounds  # a processor may round by itself
