@@ -47,7 +47,7 @@ from memcomp_lightning.testing import brute_force, enumerated, most_errors_off
 
 Model = RBM | BoltzmannMachine
 
-N_CHAINS, N_SWEEPS = 3000, 24
+N_CHAINS, N_SWEEPS, LONGER = 3000, 24, 32
 MOST_ERRORS = 8.0
 TOLERANCE = 1e-9
 
@@ -206,29 +206,31 @@ def check_drawn(model: Model, random: torch.Generator) -> Iterator[str]:
     if not model.hidden.real:
         exact = enumerated(copy.deepcopy(model).double())
         for name, draw in SAMPLERS.items():
-            off = most_errors_off(draw(model, seed), exact)
+            off = most_errors_off(draw(model, seed, N_SWEEPS), exact)
+            if not off < MOST_ERRORS:  # some models mix slowly
+                off = most_errors_off(draw(model, seed, LONGER * N_SWEEPS), exact)
             if not off < MOST_ERRORS:
                 yield f"{name}: a moment {off:.1f} standard errors off"
         yield from _ground_states(model, seed)
     yield from _annealed(copy.deepcopy(model).double(), seed)
 
 
-def _by_cd(model: Model, seed: int) -> Tensor:
+def _by_cd(model: Model, seed: int, sweeps: int) -> Tensor:
     stream = rng.stream(seed, "negative_phase")
     v = model.visible.sample(torch.zeros(N_CHAINS, model.n_visible), generator=stream)
-    sampler = CD(k=N_SWEEPS)
+    sampler = CD(k=sweeps)
     found = sampler.sample(
         model, sampler.init(model, 1, generator=stream), positive_phase(model, v), generator=stream
     )
     return _drawn(model, found.configurations, seed)
 
 
-def _by(sampler: object) -> Callable[[Model, int], Tensor]:
-    def draw(model: Model, seed: int) -> Tensor:
+def _by(sampler: object) -> Callable[[Model, int, int], Tensor]:
+    def draw(model: Model, seed: int, sweeps: int) -> Tensor:
         stream = rng.stream(seed, "negative_phase")
         state = sampler.init(model, 1, generator=stream)  # type: ignore[attr-defined]
         positive = positive_phase(model, rows_of(model, 1, stream))
-        for _ in range(N_SWEEPS // 2):
+        for _ in range(sweeps // 2):
             found = sampler.sample(model, state, positive, generator=stream)  # type: ignore[attr-defined]
             state = found.state
         return _drawn(model, found.configurations, seed)
@@ -245,7 +247,7 @@ def _drawn(model: Model, configurations: object, seed: int) -> Tensor:
 
 
 NEVER = ModeSchedule(n_updates=1000, p_max=1e-9, delay=-6.0)
-SAMPLERS: dict[str, Callable[[Model, int], Tensor]] = {
+SAMPLERS: dict[str, Callable[[Model, int, int], Tensor]] = {
     "CD": _by_cd,
     "PCD": _by(PCD(k=2, n_chains=N_CHAINS)),
     "parallel tempering": _by(ParallelTempering(k=2, n_chains=N_CHAINS, n_temperatures=3, adaptation=0.0)),
