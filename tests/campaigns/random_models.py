@@ -269,7 +269,7 @@ def _ground_states(model: Model, seed: int) -> Iterator[str]:
         found = sampler.sample(model, sampler.init(model, 1, generator=stream), None, generator=stream)
         at_means = at_real_means(model, found.configurations)
         model.visible.check(at_means.v)
-        energy = float(model.energy(at_means.v, at_means.h).min())
+        energy = float(model.energy(at_means.v, at_means.h).detach().min())
         slack = 1e-4 * (1 + abs(lowest))
         if energy < lowest - slack or (name == "brute force" and energy > lowest + slack):
             yield f"ground state by {name}: energy {energy}, and {lowest} of all states"
