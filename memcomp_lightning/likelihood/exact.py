@@ -17,10 +17,10 @@ from memcomp_lightning.likelihood.boltzmann import (
 )
 from memcomp_lightning.likelihood.layers import NUMBERS, enumerable, in_chunks, log_weights, require_finite
 from memcomp_lightning.likelihood.prefixes import N_SECOND, prefix_log_weights
-from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, pure_values
+from memcomp_lightning.likelihood.values import MOST_HIDDEN, has_free_energy, has_row_sums, pure_values
 from memcomp_lightning.models.base import EnergyModel, Images, PerReplica, PerState, Visible
 from memcomp_lightning.models.machine import log2_states, require_few_bits
-from memcomp_lightning.models.observed import check_mask, hidden_units_coupled, log_weight_of_hidden
+from memcomp_lightning.models.observed import check_mask, log_weight_of_hidden
 from memcomp_lightning.models.rbm import RBM
 from memcomp_lightning.models.units import all_states
 
@@ -166,7 +166,7 @@ def _log_sum_of_observed(model: EnergyModel, v: Tensor, observed: Tensor) -> Ten
 
 def log_likelihood_or_bound(model: EnergyModel, v: Images, log_z: PerReplica) -> PerState:
     """:func:`log_likelihood`, or :func:`log_likelihood_bound` of over 16 hidden units coupled to each other."""
-    if model.n_hidden > MOST_HIDDEN and hidden_units_coupled(model):
+    if not has_row_sums(model):
         return log_likelihood_bound(model, v, log_z)
     return log_likelihood(model, v, log_z)
 

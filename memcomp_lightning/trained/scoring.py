@@ -18,9 +18,8 @@ from memcomp_lightning.likelihood import log_likelihood_or_bound, log_pseudo_lik
 from memcomp_lightning.likelihood.layers import NUMBERS
 from memcomp_lightning.likelihood.missing import MissingChains, finders, of_observed
 from memcomp_lightning.likelihood.missing.choice import MOST_MISSING_BITS
-from memcomp_lightning.likelihood.values import MOST_HIDDEN
+from memcomp_lightning.likelihood.values import has_row_sums
 from memcomp_lightning.models import DBN, EnergyModel
-from memcomp_lightning.models.observed import hidden_units_coupled
 from memcomp_lightning.trained.partition import Annealing, LogZ, log_z_of
 from memcomp_lightning.trained.run import Run
 from memcomp_lightning.trained.values import values
@@ -137,7 +136,7 @@ def _likelihoods(
     at = whole.nonzero().flatten()
     if len(at):
         minus_free[at] = log_likelihood_or_bound(model, v[at], v.new_zeros((), dtype=torch.float64))
-    if model.n_hidden > MOST_HIDDEN and hidden_units_coupled(model):
+    if not has_row_sums(model):
         notes.append("log_likelihood is a lower bound, in the mean field: hidden units are coupled to each other")
     at = (~whole).nonzero().flatten()
     if observed is not None and len(at):

@@ -17,7 +17,8 @@ from datetime import date
 from itertools import islice
 from pathlib import Path
 
-HELD = "held"
+HANGS_AFTER = 300
+"""Seconds after which what a cluster does is taken to hang."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,15 @@ def _tried(cases: Sequence[str], attempt: Callable[[str], Outcome], workers: int
             for future in done:
                 yield running.pop(future), future.result()
             running |= {pool.submit(attempt, case): case for case in islice(waiting, len(done))}
+
+
+def wait_until(holds: Callable[[], bool], what: str) -> None:
+    """Look again and again; a TimeoutError that says what does not hold after HANGS_AFTER seconds."""
+    until = time.monotonic() + HANGS_AFTER
+    while not holds():
+        if time.monotonic() > until:
+            raise TimeoutError(f"after {HANGS_AFTER} s it does not hold that {what}")
+        time.sleep(0.1)
 
 
 def read(file: Path) -> list[dict[str, object]]:

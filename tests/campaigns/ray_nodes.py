@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,20 +20,11 @@ import ledger
 
 ROOT = Path(__file__).parents[2]
 PORT = 26379
-HANGS_AFTER = 300
 SEEDS = (0, 1, 2, 3)
 JOB = [
     *("sampler=pcd", "callbacks=minimal", "logger=none", "preset=paper", "pretrain.iterations=1500"),
     *("finetune.iterations=2", "checkpoint_every=5", "trainer.accelerator=cpu"),
 ]
-
-
-def wait_until(holds: Callable[[], bool], what: str) -> None:
-    until = time.monotonic() + HANGS_AFTER
-    while not holds():
-        if time.monotonic() > until:
-            raise TimeoutError(f"after {HANGS_AFTER} s it does not hold that {what}")
-        time.sleep(0.1)
 
 
 def node(environment: Mapping[str, str], place: Path, *where: str) -> "subprocess.Popen[bytes]":
@@ -86,10 +77,10 @@ def node_dies(place: Path) -> ledger.Outcome:
         def training() -> list[Path]:
             return list((place / "sweep").glob("*/checkpoints/pretrain/last.ckpt"))
 
-        wait_until(lambda: len(training()) == 2 or sweep.poll() is not None, "both nodes train")
+        ledger.wait_until(lambda: len(training()) == 2 or sweep.poll() is not None, "both nodes train")
         time.sleep(1)
         kill(second.pid)
-        out, _ = sweep.communicate(timeout=HANGS_AFTER)
+        out, _ = sweep.communicate(timeout=ledger.HANGS_AFTER)
         table = place / "sweep/table.csv"
         lines = table.read_text().splitlines() if table.exists() else []
         rows = [row["n_runs"] for row in csv.DictReader(lines)]

@@ -21,14 +21,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import ledger
 
 ROOT = Path(__file__).parents[2]
-HANGS_AFTER = 300
 """Seconds after which something is given up."""
 
 CONF = """\
@@ -107,7 +106,7 @@ def cluster(place: Path) -> Iterator[Mapping[str, str]]:
             with (place / f"{daemon[0]}.log").open("wb") as log:
                 running.append(subprocess.Popen(daemon, stdout=log, stderr=log, env=environment))
             time.sleep(1)
-        wait_until(lambda: "idle" in said(environment, "sinfo", "-h", "-o", "%t"), "the node is idle")
+        ledger.wait_until(lambda: "idle" in said(environment, "sinfo", "-h", "-o", "%t"), "the node is idle")
         yield environment
     finally:
         said(environment, "scancel", "--user=root", "--signal=KILL", "--full")
@@ -122,14 +121,6 @@ def said(environment: Mapping[str, str], *command: str) -> str:
     """What a command of Slurm prints."""
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     return done.stdout + done.stderr
-
-
-def wait_until(holds: Callable[[], bool], what: str) -> None:
-    until = time.monotonic() + HANGS_AFTER
-    while not holds():
-        if time.monotonic() > until:
-            raise TimeoutError(f"after {HANGS_AFTER} s it does not hold that {what}")
-        time.sleep(0.1)
 
 
 class Sweep:
@@ -187,11 +178,11 @@ def requeued(folder: Path, environment: Mapping[str, str]) -> ledger.Outcome:
     kind, findings = "a requeued job goes on from its checkpoint; one table", []
     sweep = Sweep(folder, environment, "0,1,2")
     process = sweep.start()
-    wait_until(lambda: sweep.training(0) and sweep.training(1), "two jobs train side by side")
+    ledger.wait_until(lambda: sweep.training(0) and sweep.training(1), "two jobs train side by side")
     time.sleep(1)
     job = sweep.slurm_id(1)
     said(environment, "scontrol", "requeue", job)
-    out, err = process.communicate(timeout=HANGS_AFTER)
+    out, err = process.communicate(timeout=ledger.HANGS_AFTER)
     if process.returncode != 0:
         findings.append(f"the sweep ended with {process.returncode}: {err[-1500:]}")
     if "Going on from" not in sweep.log(1) or "Going on from" in sweep.log(0):
@@ -214,19 +205,19 @@ def cancelled(folder: Path, environment: Mapping[str, str]) -> ledger.Outcome:
     kind, findings = "after a job was cancelled the same command goes on with it alone", []
     sweep = Sweep(folder, environment, "0,1,2")
     process = sweep.start()
-    wait_until(lambda: sweep.training(0) and sweep.training(1), "two jobs train side by side")
+    ledger.wait_until(lambda: sweep.training(0) and sweep.training(1), "two jobs train side by side")
     said(environment, "scancel", sweep.slurm_id(0))
-    wait_until(lambda: len(sweep.finished()) == 2, "the other jobs have finished")
-    wait_until(lambda: not said(environment, "squeue", "-h").strip(), "no job is left")
+    ledger.wait_until(lambda: len(sweep.finished()) == 2, "the other jobs have finished")
+    ledger.wait_until(lambda: not said(environment, "squeue", "-h").strip(), "no job is left")
     # This cluster keeps no accounts (sacct), from which submitit would know that a job was cancelled.
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=HANGS_AFTER)
+    out, err = process.communicate(timeout=ledger.HANGS_AFTER)
     said_first = err.strip().splitlines()[-1] if err.strip() else ""
     if process.returncode != 130 or "Go on with: memcomp-train --multirun" not in said_first:
         findings.append(f"the interrupted command ended with {process.returncode}: {err[-1500:]}")
     written = {path: path.stat().st_mtime_ns for path in sweep.finished()}
     process = sweep.start()
-    out, err = process.communicate(timeout=HANGS_AFTER)
+    out, err = process.communicate(timeout=ledger.HANGS_AFTER)
     if process.returncode != 0 or [row["n_runs"] for row in table(folder)] != ["3"]:
         findings.append(f"the second sweep ended with {process.returncode}: {(out + err)[-1500:]}")
     if any(path.stat().st_mtime_ns != when for path, when in written.items()):
