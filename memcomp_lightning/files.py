@@ -197,6 +197,19 @@ def _is_of(value: object, hint: Any) -> bool:
     return isinstance(value, hint or NoneType)
 
 
+def stamp(path: Path) -> tuple[Path, int, int, int] | None:
+    """What tells a file from one that stood, or stands later, at the same path; None where there is none.
+
+    The same path may also mean another file after a change of the working directory: the stamp has the whole path,
+    the number of the file in its file system, its size in bytes and the time of its last change in nanoseconds.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns
+
+
 def inside(folder: Path, name: str) -> Path:
     """The place of a name in a folder.
 

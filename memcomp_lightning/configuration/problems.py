@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.values import check_values
 from memcomp_lightning.errors import UserError, require, require_choice
+from memcomp_lightning.files import stamp
 from memcomp_lightning.problems import FORMATS, Problem, Score, read_problem
 from memcomp_lightning.problems.labelled import Labelled
 from memcomp_lightning.solvers import QuboSolver, Search
@@ -53,7 +54,8 @@ def prepare(config: DictConfig) -> Prepared:
     solver = checked_solver(config)
     if not config.problem:
         raise UserError(PROBLEM_MISSING)
-    problem = _read(str(config.problem), config.format, config.maximise)
+    path = Path(str(config.problem)).expanduser()
+    problem = _read(path, stamp(path), config.format, config.maximise)
     check_memory(problem, solver)
     search = {name: config[name] for name in _OF_SEARCH}
     if search["target"] is not None:
@@ -78,9 +80,9 @@ def checked_solver(config: DictConfig) -> QuboSolver:
 
 
 @lru_cache(maxsize=1)
-def _read(file: str, format: str | None, maximise: bool) -> Problem:
-    """Read a file once, for the check and for the run."""
-    return read_problem(Path(file).expanduser(), format, maximise=maximise)
+def _read(path: Path, state: object, format: str | None, maximise: bool) -> Problem:
+    """Read a file in one state once, for the check and for the run."""
+    return read_problem(path, format, maximise=maximise)
 
 
 def _state(file: str) -> list[int]:

@@ -4,8 +4,8 @@ import re
 from collections.abc import Hashable
 from dataclasses import replace
 from functools import lru_cache
-from operator import methodcaller
-from typing import TYPE_CHECKING, TypeAlias, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -14,6 +14,7 @@ from memcomp_lightning.configuration.networks import shape_of
 from memcomp_lightning.data import ImageData, ImageDataModule, RowsDataModule, TableDataModule
 from memcomp_lightning.data.schema import Schema
 from memcomp_lightning.errors import UserError, require, require_parts
+from memcomp_lightning.files import stamp
 from memcomp_lightning.models.units import Units
 
 if TYPE_CHECKING:
@@ -67,14 +68,21 @@ def loaded(config: DictConfig, schema: Schema | None = None) -> "Data":
     require_parts("data.source", source, "source of data", ("load",))
     if schema is not None and schema.as_json()["data"] == "table" and hasattr(source, "schema"):
         source = replace(source, schema=schema)
-    data = _load_once(source) if isinstance(source, Hashable) else source.load()
+    data = _load_once(source, _files_of(config.data.source)) if isinstance(source, Hashable) else source.load()
     is_data, kind = isinstance(data, ImageData) or hasattr(data, "schema"), type(data).__name__
     require(is_data, "data.source", kind, "a load() that returns an ImageData, or data with a schema")
     return cast("Data", data)
 
 
-_load_once = lru_cache(maxsize=1)(methodcaller("load"))
-"""For the jobs of a sweep; sources are frozen, hence hashable."""
+@lru_cache(maxsize=1)
+def _load_once(source: Any, files: tuple[object, ...]) -> Any:
+    """Load a frozen source once for all jobs of a sweep, while its files stay as they are."""
+    return source.load()
+
+
+def _files_of(source: DictConfig) -> tuple[object, ...]:
+    """The states of the files that the settings of a source name."""
+    return tuple(stamp(Path(value)) for value in source.values() if isinstance(value, str))
 
 
 def settings_of_source(config: DictConfig) -> list[str]:

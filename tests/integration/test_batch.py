@@ -192,6 +192,26 @@ def test_one_problem_beside_the_settings_is_a_run_of_its_own(memcomp_solve: Solv
     assert not list(Path().glob("*.csv"))
 
 
+def test_a_file_is_read_anew_where_it_has_changed(
+    memcomp_solve: Solve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One process solves ``ring.txt``, what stands there later, and a file of the same name in another folder."""
+
+    def value() -> int:
+        assert memcomp_solve("ring.txt", "hydra.run.dir=run").status == 0
+        found: int = json.loads(Path("run/solution.json").read_text())["objective"]["value"]
+        return found
+
+    monkeypatch.chdir(tmp_path / "batch")
+    assert value() == 4
+    Path("ring.txt").write_text(RING.replace(" 1\n", " 3\n"))
+    assert value() == 12
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/ring.txt").write_text(RING.replace(" 1\n", " 7\n"))
+    monkeypatch.chdir(tmp_path / "other")
+    assert value() == 28
+
+
 REFUSED = {
     "none/*.coo": ["none/*.coo stands for no file of a problem in "],
     "problem=glob(*.coo)": ["glob(*.coo) stands for no file"],
