@@ -4,6 +4,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
@@ -14,7 +15,7 @@ from memcomp_lightning.runs.table import short_path
 
 
 class RememberSweepFolder(Callback):
-    """Hydra callback: keeps the folder of the multirun of this process, for the table at its end."""
+    """Hydra callback: keeps of a multirun its folder, for the table at its end, and nothing of its jobs."""
 
     folder: Path | None = None
     made: int | None = None
@@ -28,6 +29,10 @@ class RememberSweepFolder(Callback):
         """Called before each job, whose folder is there."""
         if self.folder is not None and self.made is None:
             RememberSweepFolder.made = self.folder.stat().st_ino
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: object) -> None:
+        """Called after each job. A launcher keeps what it returned until the last: a third of a mebibyte a job."""
+        job_return.cfg = job_return.hydra_cfg = None
 
 
 def merge(folder: Path) -> tuple[str, int]:

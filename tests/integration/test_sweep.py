@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.utils import JobReturn
+from omegaconf import DictConfig
 from running import FAST, Outcome
 
+from memcomp_lightning.cli import sweep
 from memcomp_lightning.runs import pipeline
 from memcomp_lightning.runs.lock import held
 
@@ -92,6 +95,21 @@ def test_paths_among_the_overrides_and_unfinished_jobs(memcomp_train: Run) -> No
     outcome = memcomp_train(*sweep)
     assert outcome.status == 1
     assert "killed job\n    did not finish" in outcome.out
+
+
+def test_nothing_of_a_job_is_kept_that_is_done(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A launcher keeps what each job returned until the last: with its settings a thousand took 300 MiB."""
+    forget, kept = sweep.RememberSweepFolder.on_job_end, list[JobReturn]()
+
+    def forgotten(self: sweep.RememberSweepFolder, config: DictConfig, job_return: JobReturn) -> None:
+        assert job_return.cfg is not None
+        forget(self, config, job_return)
+        kept.append(job_return)
+
+    monkeypatch.setattr(sweep.RememberSweepFolder, "on_job_end", forgotten)
+    outcome = memcomp_train("-m", "seed=0,1", *FAST, "sampler=cd", "hydra.sweep.dir=sweep")
+    assert outcome.status == 0, outcome.err
+    assert [(job.cfg, job.hydra_cfg) for job in kept] == [(None, None), (None, None)]
 
 
 def test_joblib_launcher_gives_the_same_results(memcomp_train: Run, joblib_launcher: list[str]) -> None:
