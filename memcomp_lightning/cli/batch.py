@@ -3,6 +3,7 @@
 import re
 import shlex
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,9 @@ OPTIONS = ("output", "figure", "best_known", "workers")
 """What is given for a table, as ``--NAME VALUE``, ``--NAME=VALUE`` or ``NAME=VALUE``."""
 
 PICTURES = (".png", ".svg", ".pdf")
+
+WAITS = 9
+"""Times that the table took to be written, until it is written again: writing is a tenth of all, at any length."""
 
 
 # --------------------------------------------------------------------------------------------------- what is asked
@@ -128,11 +132,17 @@ def solve_many(line: CommandLine, problems: Sequence[Path], options: Options, *,
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with answers(todo, options.workers or 1, lambda text: say(f"{command}: {text}", error=True)) as coming:
-            for number, row in enumerate(coming, start=1):
-                rows[solve_table.key(row)] = row
-                written()
-                say(f"[{number}/{len(todo)}]  {_in_a_line(row, label[solve_table.key(row)])}")
-        found = written()  # once more: other values may be known than when the rows were made
+            try:
+                due = 0.0
+                for number, row in enumerate(coming, start=1):
+                    rows[solve_table.key(row)] = row
+                    if (began := time.monotonic()) >= due:
+                        written()
+                        due = time.monotonic() + WAITS * (time.monotonic() - began)
+                    say(f"[{number}/{len(todo)}]  {_in_a_line(row, label[solve_table.key(row)])}")
+            finally:
+                # Also without new rows: other values may be known than when these were made.
+                found = written() if rows else []
         say(f"\n{solve_table.summary(found)}\n\nTable:      {short_path(table.absolute())}")
         say(f"Solutions:  {short_path(folder.absolute())}")
         if options.figure is not None and any(map(solve_table.is_answer, found)):

@@ -16,6 +16,7 @@ from memcomp_lightning.likelihood.machine_ais import MachinePath
 from memcomp_lightning.models.base import EnergyModel, Visible
 from memcomp_lightning.models.init import independent_bias
 from memcomp_lightning.models.rbm import RBM
+from memcomp_lightning.products import quick_products
 
 Schedule = Sequence[float] | Tensor
 
@@ -209,16 +210,17 @@ def _anneal(
     log_w = torch.zeros(v.shape[:-1], dtype=torch.float64, device=v.device)
     bias_gain = (model.b - base).unsqueeze(-1)
     base = base.unsqueeze(-2)
-    field = model.hidden_field(v)
-    for beta, target in tqdm(list(pairwise(betas)), desc="annealing", disable=not progress):
-        log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double()
-        log_w += model.hidden.cumulant_gain(field, beta, target)
-        if target != betas[-1]:
-            for _ in range(k):
-                h = model.hidden.sample(field.mul_(target), generator=generator)
-                towards = model.visible_field(h).mul_(target).add_(base, alpha=1 - target)
-                v = model.visible.sample(towards, generator=generator)
-                field = model.hidden_field(v)
+    with quick_products(model.parameters(), v.shape[-2]):
+        field = model.hidden_field(v)
+        for beta, target in tqdm(list(pairwise(betas)), desc="annealing", disable=not progress):
+            log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double()
+            log_w += model.hidden.cumulant_gain(field, beta, target)
+            if target != betas[-1]:
+                for _ in range(k):
+                    h = model.hidden.sample(field.mul_(target), generator=generator)
+                    towards = model.visible_field(h).mul_(target).add_(base, alpha=1 - target)
+                    v = model.visible.sample(towards, generator=generator)
+                    field = model.hidden_field(v)
     return log_w
 
 

@@ -9,6 +9,7 @@ from memcomp_lightning import defaults
 from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
+from memcomp_lightning.products import quick_products
 from memcomp_lightning.training import (
     FINETUNING_SGD,
     LOSSES,
@@ -88,8 +89,9 @@ class Classifier(StageModule):
         if self.filling is not None:
             batch = self.filling.complete(batch, self.streams["missing"])
         dropout = Dropout(self.dropout, [self.streams["dropout"]]) if self.dropout else None
-        loss, losses, logits = ClassifierStep(network, self.loss, dropout).loss(batch)
-        self.update(loss, closes_step=batch.closes_step)
+        with quick_products(network.parameters(), batch.v.shape[-2]):
+            loss, losses, logits = ClassifierStep(network, self.loss, dropout).loss(batch)
+            self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": score_of(losses, logits, batch.label)}
 
     def validation_step(self, batch: Given, batch_idx: int) -> dict[str, object]:

@@ -23,6 +23,7 @@ from memcomp_lightning.models import EnergyModel
 from memcomp_lightning.models.units import Units
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.objective import Centring, Offsets, weighted
+from memcomp_lightning.products import quick_products
 from memcomp_lightning.samplers import tensors_of, with_tensors
 from memcomp_lightning.samplers.base import require_sampler
 from memcomp_lightning.training import (
@@ -41,7 +42,7 @@ from memcomp_lightning.training import (
 )
 from memcomp_lightning.training.given import Given, as_batch
 from memcomp_lightning.training.stages.base import check_stage
-from memcomp_lightning.types import NegativePhase
+from memcomp_lightning.types import Batch, NegativePhase
 
 CENTRED = Centring(rate=defaults.CENTRING_RATE)
 
@@ -299,10 +300,12 @@ class EnergyPretraining(StageModule):
     @with_gradient()
     def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
-        layer = self.layer
-        phase = self.phases[layer]
-        model = phase.model
-        batch = as_batch(batch, self._units)
+        batch, phase = as_batch(batch, self._units), self.phases[self.layer]
+        with quick_products(phase.model.parameters(), batch.v.shape[-2]):
+            return self._train_on(batch, phase)
+
+    def _train_on(self, batch: Batch, phase: Phase) -> dict[str, object]:
+        model, layer = phase.model, self.layer
         with torch.no_grad():
             v, (positive, inferred) = phase.positive_of(batch, self.streams["positive_phase"])
             positive = weighted(positive, batch.weight)

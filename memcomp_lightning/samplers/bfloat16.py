@@ -1,16 +1,13 @@
 """Products of matrices in bfloat16 while a chain is swept."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
-import torch
 from torch import Generator
 
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel
+from memcomp_lightning.products import by_onednn, multiplies_in_bfloat16
 from memcomp_lightning.samplers.cd import CD
 from memcomp_lightning.samplers.pcd import PCD
 from memcomp_lightning.types import Configurations, NegativePhase
@@ -63,32 +60,5 @@ class InBfloat16:
         self, model: EnergyModel, state: Any, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[Any]:
         """Return what the sampler returns."""
-        with _rounded_products():
+        with by_onednn():
             return self.sampler.sample(model, state, positive, generator=generator)
-
-
-@cache
-def multiplies_in_bfloat16() -> bool:
-    """Whether torch does so on this processor, found by a product: instructions for it may lie unused."""
-    if not torch.backends.mkldnn.is_available():
-        return False
-    finer_than_bfloat16 = torch.full((_TRIED, _TRIED), 1 + 2.0**-12, dtype=torch.float32, device="cpu")
-    one = torch.eye(_TRIED, dtype=torch.float32, device="cpu")
-    with _rounded_products():
-        return not (finer_than_bfloat16 @ one).equal(finer_than_bfloat16)
-
-
-_TRIED = 256
-"""Rows and columns; torch may leave small products as they are."""
-
-
-@contextmanager
-def _rounded_products() -> Iterator[None]:
-    """Let torch multiply float32 matrices in bfloat16."""
-    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
-    before = matmul.fp32_precision
-    matmul.fp32_precision = "bf16"
-    try:
-        yield
-    finally:
-        matmul.fp32_precision = before

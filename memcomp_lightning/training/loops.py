@@ -16,6 +16,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import Centring, weighted
+from memcomp_lightning.products import quick_products
 from memcomp_lightning.samplers.base import holds_chains, positive_phase
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import JUDGED_BY, BestPass
@@ -164,17 +165,18 @@ class PhaseTraining:
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         state, phase = self._state, self.phase
         for batch in updates_of(batches, self._units):
-            with torch.no_grad():
-                _, found = phase.positive_of(batch, self.streams["positive_phase"])
-                positive = weighted(found.configurations, batch.weight)
-            _, _, state = self.step.add_gradient(
-                phase.model,
-                positive,
-                state,
-                share=batch.share,
-                generator=self.streams["negative_phase"],
-                valued=False,
-            )
+            with quick_products(phase.model.parameters(), batch.v.shape[-2]):
+                with torch.no_grad():
+                    _, found = phase.positive_of(batch, self.streams["positive_phase"])
+                    positive = weighted(found.configurations, batch.weight)
+                _, _, state = self.step.add_gradient(
+                    phase.model,
+                    positive,
+                    state,
+                    share=batch.share,
+                    generator=self.streams["negative_phase"],
+                    valued=False,
+                )
             if batch.closes_step:
                 self.optimizer.step()
                 phase.model.project()
@@ -216,7 +218,8 @@ class ClassifierTraining:
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         step = ClassifierStep(self.network, self.loss, self.dropout)
         for batch in updates_of(batches):
-            step.add_gradient(batch)
+            with quick_products(self.network.parameters(), batch.v.shape[-2]):
+                step.add_gradient(batch)
             if batch.closes_step:
                 self.optimizer.step()
                 self.optimizer.zero_grad()

@@ -7,12 +7,15 @@ import shlex
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from running import Outcome, launch
 
+from memcomp_lightning.cli import batch
 from memcomp_lightning.problems import read_problem
+from memcomp_lightning.runs import solve_table
 
 Solve = Callable[..., Outcome]
 RING = "5 5\n" + "".join(f"{i} {i % 5 + 1} 1\n" for i in range(1, 6))
@@ -284,3 +287,33 @@ def test_commands_of_the_page_run_in_their_order(memcomp_solve: Solve) -> None:
     assert "4 of 16 answers" in outcomes[4].out
     assert rows()[-1]["problem"] == "three"
     assert Path("gap.png").exists()
+
+
+def test_a_long_table_is_not_written_for_each_of_its_rows(
+    memcomp_solve: Solve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It took half of the time of a thousand rows. All are there at the end, and where it is interrupted."""
+    write, written, seconds = solve_table.write_rows, list[int](), iter(range(10**6))
+
+    def slow(table: Path, found: list[solve_table.Row]) -> None:
+        for _ in range(10):
+            next(seconds)
+        written.append(len(found))
+        write(table, found)
+
+    monkeypatch.setattr(solve_table, "write_rows", slow)
+    monkeypatch.setattr(batch, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    seeds = "seed=" + ",".join(map(str, range(60)))
+    arguments = ["batch/ring.txt", "solver=alternating_descent", seeds, "--output", "results.csv"]
+    assert memcomp_solve(*arguments).status == 0
+    assert written[0] == 1
+    assert written[-1] == len(rows()) == 60
+    assert len(written) < 60 / batch.WAITS
+    monkeypatch.setattr(batch, "_in_a_line", lambda *_: interrupt())
+    stopped = memcomp_solve(*arguments[:-1], "other.csv")
+    assert stopped.status == 130
+    assert len(rows("other.csv")) == 1
+
+
+def interrupt() -> str:
+    raise KeyboardInterrupt
