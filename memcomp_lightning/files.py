@@ -72,11 +72,12 @@ def _tidy(folder: Path) -> None:
     with suppress(OSError):  # no folder; nothing of ours
         for path in at.glob(f".*.{_MACHINE}.*.partial"):
             writer = path.name.split(".")[-2]
-            if writer.isdecimal() and int(writer) != os.getpid() and not _lives(int(writer)):
+            if writer.isdecimal() and int(writer) != os.getpid() and not lives(int(writer)):
                 path.unlink()
 
 
-def _lives(process: int) -> bool:
+def lives(process: int) -> bool:
+    """Whether this machine has a process of such a number; on Windows, where that cannot be asked, yes."""
     if os.name == "nt":  # a signal of 0 is no question there
         return True
     try:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.files import lives
 
 NAME = ".lock"
 
@@ -146,13 +147,7 @@ def _lives_here(path: Path, holder: dict[str, Any]) -> bool:
         return False
     if pid == os.getpid() and path.absolute() not in _held_here:
         return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return _start(pid) == holder.get("start")
+    return lives(pid) and _start(pid) == holder.get("start")
 
 
 def _touched(path: Path, holder: dict[str, Any]) -> bool:
