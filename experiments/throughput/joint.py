@@ -19,6 +19,7 @@ from torch.optim import SGD
 from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.models import DBN
+from memcomp_lightning.products import quick_products
 from memcomp_lightning.samplers import PCD
 from memcomp_lightning.training import Joint, PhaseTraining
 
@@ -84,6 +85,10 @@ class ByHand:
 
     @torch.no_grad()
     def run_pass(self, images: Tensor) -> None:
+        with quick_products([self.w1], BATCH):  # as ours
+            self._run_pass(images)
+
+    def _run_pass(self, images: Tensor) -> None:
         for batch in batches_of(images):
             v, n = batch.v, len(batch.v)
             h1, h2 = self.means(v)

@@ -15,6 +15,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.data import Batches
 from memcomp_lightning.models import DBN
 from memcomp_lightning.models.units import Categorical, Gaussian, Units
+from memcomp_lightning.products import quick_products
 from memcomp_lightning.samplers import CD, PCD
 from memcomp_lightning.training import Greedy, pretrain
 
@@ -162,7 +163,8 @@ def theirs(units: Units, n_hidden: int, sampler: str, v: Tensor, draw: Draw) -> 
     chains = None if begin is None else units.sample(begin, generator=generator)
 
     def run() -> None:
-        by_hand(batches_of(v), model, visible, chains=chains, precision=real, generator=generator)
+        with quick_products([model.weight], BATCH):  # as ours
+            by_hand(batches_of(v), model, visible, chains=chains, precision=real, generator=generator)
 
     return timed(run), model
 
