@@ -4,6 +4,7 @@ import string
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -56,6 +57,14 @@ class SequenceData:
     def n_sites(self) -> int:
         """Length of the sequences."""
         return self.schema.n_sites
+
+    share: ClassVar[None] = None
+    """Each process holds all sequences."""
+
+    @property
+    def n_train(self) -> int:
+        """Training sequences."""
+        return self.train.n
 
     @property
     def effective_number(self) -> float:
