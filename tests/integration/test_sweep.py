@@ -118,17 +118,17 @@ def test_a_job_that_its_launcher_lost_is_named(memcomp_train: Run, monkeypatch: 
     def one_less(self: Any, jobs: Any, initial_job_idx: int) -> Any:
         return launch(self, jobs[:-1], initial_job_idx)
 
-    launch = launching(monkeypatch, one_less)
     sweep = ["-m", "sampler=cd", "seed=0,1,2", *FAST, "hydra.sweep.dir=sweep"]
     for own in ([], ["hydra.sweep.subdir=job${hydra.job.num}"]):
-        outcome = memcomp_train(*sweep, *own)
+        with monkeypatch.context() as patched:
+            launch = launching(patched, one_less)
+            outcome = memcomp_train(*sweep, *own)
         assert outcome.status == 1
         assert [row["n_runs"] for row in rows("sweep/table.csv")] == [str(2 * len(own) + 2)]
         lost = outcome.out.partition("1 failed")[2].splitlines()[1:3]
         assert "seed=2" in lost[0]
         assert "seed=1" not in lost[0]
         assert lost[1] == "    left nothing in sweep: its launcher lost it"
-    monkeypatch.undo()
     assert memcomp_train(*sweep).status == 0
 
 
