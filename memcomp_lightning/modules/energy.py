@@ -389,11 +389,14 @@ class _OfTrainer(Processes):
     def __init__(self, trainer: pl.Trainer, device: torch.device) -> None:
         self._trainer, self._device = trainer, device
 
-    def means(self, values: Sequence[Tensor], share: float = 1.0) -> Sequence[Tensor]:
+    def means(self, values: Sequence[Tensor], share: float | None = None) -> Sequence[Tensor]:
         """All of them in one message; Lightning would send each by itself, with a barrier before it."""
-        together = torch.cat([*(share * value.reshape(-1) for value in values), values[0].new_full((1,), share)])
+        together = torch.cat([value.reshape(-1) for value in values])
+        if share is not None:
+            together = torch.cat([share * together, together.new_full((1,), share)])
         torch.distributed.all_reduce(together)
-        parts = (together[:-1] / together[-1]).split([value.numel() for value in values])
+        n = self._trainer.world_size if share is None else together[-1]
+        parts = (together / n)[: sum(value.numel() for value in values)].split([value.numel() for value in values])
         return [part.view_as(value) for part, value in zip(parts, values, strict=True)]
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:

@@ -20,8 +20,8 @@ Sampler: TypeAlias = NegativePhaseSampler[Any, Any]
 class Processes:
     """The processes that share an update, each with images of its own: here one, alone."""
 
-    def means(self, values: Sequence[Tensor], share: float = 1.0) -> Sequence[Tensor]:
-        """The mean of each value over all of them, in which this one counts by its share."""
+    def means(self, values: Sequence[Tensor], share: float | None = None) -> Sequence[Tensor]:
+        """The mean of each value over all of them, in which this one counts by its share; None is all alike."""
         return values
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
