@@ -39,8 +39,10 @@ def rows_of_stage(config: DictConfig, stage: str, data: "Data", units: Units) ->
     """Batches of a stage: what learns labels takes the rows that have one, fine-tuning as many as it is told."""
     settings = {name: config.data[name] for name in DEALT}
     if settings["validation_fraction"] is None:
-        alone = isinstance(data, ImageData) or data.validation is not None or data.n_train < FEWEST_TO_HOLD_OUT
-        settings["validation_fraction"] = 0.0 if alone or not config.pretrain.keep_best else HELD_OUT
+        alone = isinstance(data, ImageData) or data.validation is not None
+        # Of all processes, where they share the rows.
+        few = not isinstance(data, ImageData) and getattr(data, "n_train", data.train.n) < FEWEST_TO_HOLD_OUT
+        settings["validation_fraction"] = 0.0 if alone or few or not config.pretrain.keep_best else HELD_OUT
     settings |= {"batch_size": config[stage].batch_size, "seed": config.seed}
     if stage == "updown" and config.updown.labels:
         settings["labels"] = "all"

@@ -95,7 +95,7 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
 def processes_of(config: DictConfig) -> tuple[int, int]:
     """Number of this process, and how many train together, by the settings of the trainer."""
     try:
-        settings = {**_settings(config.trainer), "logger": False, "enable_checkpointing": False}
+        settings = {**_settings(config.trainer), "max_epochs": 1, "logger": False, "enable_checkpointing": False}
         trainer: pl.Trainer = instantiate(settings, _convert_="all")
     except (MisconfigurationException, RuntimeError) as error:
         raise UserError(f"trainer: {explain(error)}") from error

@@ -380,7 +380,7 @@ class TableDataModule(RowsDataModule):
 
     def __init__(self, table: "TableData | SequenceData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
-        own |= {"validation": table.validation, "units": table.units(), "share": table.share}
+        own |= {"validation": table.validation, "units": table.units(), "share": getattr(table, "share", None)}
         super().__init__(table.train, table.test, **own, **settings)
         self.table = table
 

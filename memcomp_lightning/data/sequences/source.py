@@ -4,7 +4,6 @@ import string
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -57,14 +56,6 @@ class SequenceData:
     def n_sites(self) -> int:
         """Length of the sequences."""
         return self.schema.n_sites
-
-    share: ClassVar[None] = None
-    """Each process holds all sequences."""
-
-    @property
-    def n_train(self) -> int:
-        """Training sequences."""
-        return self.train.n
 
     @property
     def effective_number(self) -> float:

@@ -467,7 +467,7 @@ def _summaries(
 
 def _whole(parts: Sequence[Part], schema: TableSchema, *, complete: bool = True) -> Rows:
     """All rows of files that are small enough to be joined."""
-    v, label, weight = list[NDArray[Any]](), list[NDArray[Any]](), list[NDArray[Any]]()
+    v, label, weight, n = list[NDArray[Any]](), list[NDArray[Any]](), list[NDArray[Any]](), 0
     for file, begin in parts:
         found, first = begin(), 0
         for batch in found.batches:
@@ -481,8 +481,9 @@ def _whole(parts: Sequence[Part], schema: TableSchema, *, complete: bool = True)
             if part.weight is not None:
                 weight.append(part.weight)
             first += batch.num_rows
-        if not first:
-            raise UserError(f"{file} has no rows.")
+        n += first
+    if not n:
+        raise UserError(f"{parts[0].name} has no rows.")
     joined = [torch.from_numpy(_joined(parts)) for parts in (v, label, weight) if parts]
     return _rows(joined[0], joined[1], joined[2] if len(joined) > 2 else None)
 
