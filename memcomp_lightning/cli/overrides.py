@@ -140,10 +140,10 @@ def check_command_line(
     if not line.multirun:
         return line
     line = replace(line, planned=() if searches else tuple(planned))
-    if (path := line.claimed or root) is None:
+    if (whole := line.claimed or root) is None:
         return line
     others = tuple(o for o in line.overrides if o.partition("=")[0] != key)
-    return replace(line, overrides=(*others, with_path(key, path.absolute())))
+    return replace(line, overrides=(*others, with_path(key, whole.absolute())))
 
 
 def _folder(sweep: DictConfig) -> Path | None:
