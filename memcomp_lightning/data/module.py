@@ -11,7 +11,7 @@ from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.labels import with_label, with_labels
 from memcomp_lightning.data.loading import Batches
-from memcomp_lightning.data.rows import UNLABELLED, Part, Rows, Share
+from memcomp_lightning.data.rows import UNLABELLED, Origin, Part, Rows, Share
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
@@ -66,6 +66,7 @@ class RowsDataModule(LightningDataModule):
             its share; the held-out share of these is held out. None takes all rows.
         share: Of all rows that this process holds: ``train`` and ``test`` are its own alone, and which rows are
             held out does not depend on the number of processes. None where it holds all.
+        origin: Several files that the rows are from, by which they are told from others; None goes by all numbers.
     """
 
     most_numbers: ClassVar[int | None] = None
@@ -90,6 +91,7 @@ class RowsDataModule(LightningDataModule):
         partition_seed: int = 0,
         labels: int | Literal["all"] | None = None,
         share: Share | None = None,
+        origin: Origin | None = None,
     ) -> None:
         super().__init__()
         self.units, self.n_classes, self.data_name, self.pixel_layout = units, n_classes, name, pixel_layout
@@ -118,7 +120,7 @@ class RowsDataModule(LightningDataModule):
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
             at = order[..., : n_part - n_held_out]
             heldout_at = order[..., n_part - n_held_out :] if n_held_out else None
-        self._share = share
+        self._share, self._origin = share, origin
         self._held: list[int] | None = None
         if share is not None:
             self.n_train = n_all if at is None else at.shape[-1]
@@ -316,11 +318,9 @@ class RowsDataModule(LightningDataModule):
         return Batches(v, label, None, **settings)
 
     def _fingerprint(self, part: Part) -> str:
-        share = self._share
-        if share is not None and (
-            part.rows is self._train.rows or (part is self._test and share.test is not None)
-        ):
-            return share.fingerprint
+        origin = self._origin
+        if origin is not None and (part.rows is self._train.rows or (part is self._test and origin.splits)):
+            return origin.fingerprint
         return part.rows.fingerprint
 
     def _values(self, kept: Rows) -> tuple[Tensor, Tensor]:
@@ -380,7 +380,8 @@ class TableDataModule(RowsDataModule):
 
     def __init__(self, table: "TableData | SequenceData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
-        own |= {"validation": table.validation, "units": table.units(), "share": getattr(table, "share", None)}
+        own |= {"validation": table.validation, "units": table.units()}
+        own |= {name: getattr(table, name, None) for name in ("share", "origin")}
         super().__init__(table.train, table.test, **own, **settings)
         self.table = table
 

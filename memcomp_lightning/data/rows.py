@@ -62,8 +62,6 @@ class Share:
             :class:`Rows`. ``test`` is None where each process holds all test rows.
         some_train, some_test: Evenly spaced rows of all.
         some_at: Which training rows the first of them are, ``(n_some,)``.
-        files: That the rows were read from.
-        split: What split them into training and test rows.
     """
 
     rank: int
@@ -73,8 +71,6 @@ class Share:
     some_train: Rows
     some_test: Rows | None
     some_at: Tensor
-    files: Sequence[Path]
-    split: str
 
     def held(self, holder: Tensor) -> list[int]:
         """How many of the rows with these holders each process has."""
@@ -85,6 +81,21 @@ class Share:
         mine = self.train == self.rank
         place = mine.cumsum(0) - 1
         return place[at[mine[at]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Files that rows were read from, which stand for the rows where nobody may hold all of these.
+
+    Attributes:
+        files: In their order.
+        split: What split the rows into training and test rows.
+        splits: Whether test rows are among them.
+    """
+
+    files: Sequence[Path]
+    split: str
+    splits: bool
 
     @cached_property
     def fingerprint(self) -> str:

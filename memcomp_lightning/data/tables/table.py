@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from memcomp_lightning import rng
 from memcomp_lightning.data.images import PixelLayout
-from memcomp_lightning.data.rows import UNLABELLED, Rows, Share
+from memcomp_lightning.data.rows import UNLABELLED, Origin, Rows, Share
 from memcomp_lightning.data.tables.cells import CellError, Cells
 from memcomp_lightning.data.tables.columns import Words
 from memcomp_lightning.data.tables.find import Summary, find, roles_of
@@ -45,6 +45,7 @@ class TableData:
         minus_one: Rows of the file without a label because theirs is -1.
         share: Of all rows that this process holds: then ``train`` and ``test`` are its own alone.
         missing: Share of the cells of all rows that are empty.
+        origin: The files of a table in several.
     """
 
     train: Rows
@@ -57,6 +58,7 @@ class TableData:
     minus_one: int = 0
     share: Share | None = None
     missing: float = 0.0
+    origin: Origin | None = None
 
     @property
     def n_train(self) -> int:
@@ -252,15 +254,17 @@ def table_data(
     sizes, blocks = [n - n_test, n_test], _blocks(n, share[1])
     masked = True if several and missing > 0 else None  # by all processes alike
     train, rest = _split(joined, name, schema, sizes, order, blocks[share[0]], masked)
-    made = TableData(train, apart.get("test", rest), apart.get("validation"), schema, name, layout, ignored)
+    files = [Path(part.name) for part in parts]
+    origin = Origin(files, f"{sizes} {split_seed}", n_test > 0) if len(parts) > 1 else None
+    test, validation = apart.get("test", rest), apart.get("validation")
+    made = TableData(train, test, validation, schema, name, layout, ignored, missing=missing, origin=origin)
     if some is None or order is None:
         minus_one = _minus_one(summaries, [train, rest], schema)
-        return replace(made, minus_one=minus_one, missing=missing)
+        return replace(made, minus_one=minus_one)
     holder = _holders(order, blocks)
     first, last = some.rows(schema, joined, sizes[0], masked)
     return replace(
         made,
-        missing=missing,
         share=Share(
             *share,
             holder[: sizes[0]],
@@ -268,8 +272,6 @@ def table_data(
             first.rows,
             last.rows if n_test else None,
             first.places,
-            [Path(part.name) for part in parts],
-            f"{sizes} {split_seed}",
         ),
     )
 

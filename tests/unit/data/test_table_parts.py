@@ -187,8 +187,11 @@ def test_processes_hold_each_row_once_and_hold_out_the_same(tmp_path: Path, n: i
     held = [len(module.table.train.v) + len(module.table.test.v) for module in found]
     assert max(held) - min(held) <= 1
     assert all(module.train_observed is not None for module in found)
-    assert all(len(module.fingerprints) == len(one.fingerprints) for module in found)
-    assert len({tuple(module.fingerprints.values()) for module in found}) == 1
+    joined = TableDataModule(Table(path=parts, columns={"w": "ignore"}).load(), validation_fraction=fraction)
+    assert all(module.fingerprints == joined.fingerprints for module in found)
+    assert list(joined.fingerprints) == list(one.fingerprints)
+    other = TableDataModule(Table(path=parts, columns={"w": "ignore"}, split_seed=1).load())
+    assert other.fingerprints["train"] != joined.fingerprints["train"]
     assert f"{one.table.train.n:,} rows to train on, {one.table.test.n:,} test rows" in found[-1].described
     for module in found:
         assert in_order(module.some_train().v).equal(in_order(one.train[0]))
