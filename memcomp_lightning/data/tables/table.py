@@ -236,7 +236,7 @@ def table_data(
         order, n_test = _order(n, name, test_fraction, split_seed) if "test" not in further else (np.arange(n), 0)
     ignore = {column for column, kind in given.items() if kind == "ignore"}
     trained = None if order is None else order < len(order) - n_test
-    joined, some = Joined(parts), _Some(order) if several else None
+    joined, some = Joined(parts), _Some(name, order) if several else None
     summaries, n, named = _summaries(joined, name, ignore, trained, some)
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
@@ -306,9 +306,9 @@ class _Placed(NamedTuple):
 class _Some:
     """Evenly spaced rows of all, which are kept as they were read until it is known what the columns are."""
 
-    def __init__(self, order: NDArray[np.int64] | None) -> None:
+    def __init__(self, name: str, order: NDArray[np.int64] | None) -> None:
         assert order is not None
-        self._order, self._step, self._n = order, 0, 0
+        self._name, self._order, self._step, self._n = name, order, 0, 0
         self._kept: list[Any] = []
         self._numbers: list[int] = []
 
@@ -331,7 +331,7 @@ class _Some:
         for batch in self._kept:
             names = [joined.place(number + 1) for number in self._numbers[first : first + batch.num_rows]]
             first += batch.num_rows
-            encoded.append(schema.encode(batch, "the table", names))
+            encoded.append(schema.encode(batch, self._name, names))
         self._kept = []
         v, label = (
             np.concatenate(parts)[in_turn] for parts in ([e.v for e in encoded], [e.label for e in encoded])

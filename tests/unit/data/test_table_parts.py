@@ -283,3 +283,11 @@ def test_a_part_that_has_changed_is_read_anew(tmp_path: Path) -> None:
         before = _files_of(source)
         os.utime(Path(parts) / "2.csv", ns=(1, len(path)))
         assert _files_of(source) != before
+
+
+def test_each_process_is_told_of_a_cell_in_the_block_of_another(tmp_path: Path) -> None:
+    good = [str(k / 30) for k in range(20)]
+    path = parts_of(tmp_path, rows(*good), rows(*good[:3], "7", *good))
+    for rank in range(2):
+        with pytest.raises(UserError, match=r"column 'x', row 4( of .*1.csv)?: '7' is not allowed"):
+            Table(path=path, columns={"x": "probability"}, share=(rank, 2)).load()
