@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import glob
 import io
 import json
 import os
@@ -209,6 +210,16 @@ def stamp(path: Path) -> tuple[Path, int, int, int] | None:
     except OSError:
         return None
     return path.absolute(), found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def meant_by(path: str) -> list[Path]:
+    """The files that a path means, by name: those in a folder, those that match a pattern, or itself."""
+    alone = Path(path)
+    if alone.is_dir():
+        return sorted(file for file in alone.iterdir() if file.is_file())
+    if not os.path.exists(path) and glob.has_magic(path):  # noqa: PTH110 (a pattern may be no possible name)
+        return sorted(file for file in map(Path, glob.glob(path, recursive=True)) if file.is_file())  # noqa: PTH207
+    return [alone]
 
 
 def inside(folder: Path, name: str) -> Path:

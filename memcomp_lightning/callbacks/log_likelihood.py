@@ -2,7 +2,7 @@
 
 import logging
 from itertools import takewhile
-from typing import Any, ClassVar, Literal, TypedDict
+from typing import Any, ClassVar, Literal, TypedDict, cast
 
 import lightning.pytorch as pl
 import torch
@@ -186,8 +186,7 @@ class LogLikelihood(EveryIterations):
         # A validation in the middle of the pass has judged another model.
         judged = bool(self._heldout) and self._judged_at == trainer.global_step
         if judged:
-            n_images = sum(n for _, n in self._heldout)
-            values["log_likelihood_heldout"] = sum(total for total, _ in self._heldout) / n_images - log_z
+            values["log_likelihood_heldout"] = self._mean_of_heldout(trainer) - log_z
         log_scalars(pl_module, values)
         gap = values.get("log_z_gap")
         self.history.append(
@@ -201,6 +200,14 @@ class LogLikelihood(EveryIterations):
             )
         )
         self._say_if_behind(pl_module)
+
+    def _mean_of_heldout(self, trainer: pl.Trainer) -> Tensor:
+        """Unnormalised, over the held-out images of all processes; those that each of them holds count alike."""
+        total = torch.stack([total for total, _ in self._heldout]).sum(0)
+        sums = torch.cat([total.reshape(-1), total.new_tensor([sum(n for _, n in self._heldout)])])
+        if trainer.world_size > 1:
+            sums = cast(Tensor, trainer.strategy.reduce(sums, reduce_op="sum"))
+        return (sums[:-1] / sums[-1]).view_as(total)
 
     def state_dict(self) -> dict[str, Any]:
         """The values so far."""

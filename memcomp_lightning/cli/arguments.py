@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -41,6 +41,18 @@ _DASHES = "".join(map(chr, (*range(0x2010, 0x2016), 0x2212, 0xFE58, 0xFE63, 0xFF
 _QUOTES = "".join(map(chr, (*range(0x2018, 0x2020), 0xAB, 0xBB)))
 
 
+class Planned(NamedTuple):
+    """A job of a sweep.
+
+    Attributes:
+        folder: Its name in the folder of the sweep; None where it is known to the job alone.
+        overrides: Its own settings.
+    """
+
+    folder: str | None
+    overrides: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class CommandLine:
     """What was typed.
@@ -53,6 +65,7 @@ class CommandLine:
         package: The part of the configuration that is shown, None for all of it.
         problems: Files, folders and patterns as typed, of a command that takes them, in a run.
         claimed: The folder that was made for this command, None before that or where the arguments name one.
+        planned: The jobs of a sweep, once it is checked; none of a search, which decides as it goes.
     """
 
     overrides: tuple[str, ...]
@@ -62,6 +75,7 @@ class CommandLine:
     package: str | None
     problems: tuple[str, ...] = ()
     claimed: Path | None = None
+    planned: tuple[Planned, ...] = ()
 
     @property
     def arguments(self) -> list[str]:

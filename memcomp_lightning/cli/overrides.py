@@ -21,7 +21,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from memcomp_lightning.cli.arguments import CommandLine, parse
+from memcomp_lightning.cli.arguments import CommandLine, Planned, parse
 from memcomp_lightning.cli.search import named_by_time, planned_jobs
 from memcomp_lightning.configuration.composition import (
     CONFIG_MODULE,
@@ -73,7 +73,8 @@ def check_command_line(
 
     Returns:
         The line with a folder that is this command's alone: where the settings name it by the time, it is made
-        here, and a second command of the same second gets another.
+        here, and a second command of the same second gets another. That of a sweep is told from the root, as
+        launchers start jobs in other working directories; its jobs are listed.
 
     Raises:
         UserError: Naming the setting, its value, what is allowed and, in a sweep, the job.
@@ -89,6 +90,8 @@ def check_command_line(
         check_is_folder(key, line.value(key))
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
     folder: str | None = None
+    root: Path | None = None
+    planned = list[Planned]()
     with composing():
         paths = search_paths(overrides)
         try:
@@ -110,6 +113,11 @@ def check_command_line(
                 if line.shows:
                     _check_package(config, line.package)
                     continue
+                if line.multirun:
+                    root = _folder(config.hydra.sweep)
+                    planned.append(
+                        Planned(_named(config.hydra.sweep), tuple(o for o in job if not o.startswith("hydra.")))
+                    )
                 with open_dict(config):
                     del config["hydra"]
                 if searches and check_searchable is not None:
@@ -124,10 +132,39 @@ def check_command_line(
                     own = isinstance(error, UserError)
                     message = explain(error) if own else _naming_override(explain(error), job)
                 raise UserError(message + where) from error
-    if line.shows or line.value(key) is not None or folder is None:
+    if line.shows:
         return line
-    path = claimed(Path(folder))
-    return replace(line, overrides=(*line.overrides, with_path(key, path)), claimed=path)
+    if line.value(key) is None and folder is not None:
+        path = claimed(Path(folder))
+        line = replace(line, overrides=(*line.overrides, with_path(key, path)), claimed=path)
+    if not line.multirun:
+        return line
+    line = replace(line, planned=() if searches else tuple(planned))
+    if (whole := line.claimed or root) is None:
+        return line
+    others = tuple(o for o in line.overrides if o.partition("=")[0] != key)
+    return replace(line, overrides=(*others, with_path(key, whole.absolute())))
+
+
+def _folder(sweep: DictConfig) -> Path | None:
+    """The folder of a sweep, for all its jobs; None where Hydra fills in a path from the root."""
+    typed = str(OmegaConf.to_container(sweep, resolve=False)["dir"])  # type: ignore[call-overload, index]
+    if "${hydra" not in typed:
+        return Path(str(sweep.dir))
+    if not typed.startswith("/"):
+        raise UserError(
+            f"hydra.sweep.dir = {typed} is not allowed: expected a path from the root where Hydra fills it in, as "
+            f"jobs may start in other folders: hydra.sweep.dir={Path.cwd()}/NAME"
+        )
+    return None
+
+
+def _named(sweep: DictConfig) -> str | None:
+    """Name of a job's folder, where it does not depend on the number of the job."""
+    try:
+        return str(sweep.subdir)
+    except OmegaConfBaseException:
+        return None
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from memcomp_lightning.callbacks import (
     BestWeights,
     StillFalling,
 )
-from memcomp_lightning.configuration.composition import STUDIES
+from memcomp_lightning.configuration.composition import STUDIES, study_of
 from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.hydra_versions import instantiate
 from memcomp_lightning.configuration.networks import network_of, shape_of
@@ -102,7 +102,9 @@ def build(config: DictConfig) -> Plan:
         numbers = isinstance(values, ListConfig) and all(isinstance(x, int | float) for x in values)
         require(numbers, f"tried.{name}", values, "a list of numbers")
     earlier = earlier_of(config)
-    data = loaded(config, None if earlier is None else earlier.schema)
+    # Studies and choices train in one process, without a trainer.
+    shared = study_of(config) is None and config.choose is None
+    data = loaded(config, None if earlier is None else earlier.schema, shared=shared)
     if earlier is not None:
         earlier.check_data(ImageSchema.of(data) if isinstance(data, ImageData) else data.schema)
     shape = shape_of(data, config)

@@ -73,7 +73,7 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
             require(not of_its_own, "trainer.strategy", strategy, allowed, "Use trainer.strategy=ddp.")
         except (MisconfigurationException, RuntimeError) as error:
             raise UserError(f"trainer, {stage.module.stage}: {explain(error)}") from error
-        n_batches = len(stage.data.train_batches(0, trainer.world_size))
+        n_batches = len(stage.data.train_batches(trainer.global_rank, trainer.world_size))
         every, passes = trainer.val_check_interval, trainer.check_val_every_n_epoch
         within = isinstance(every, float) or passes is None or every is None or every <= n_batches
         allowed = f"at most the {n_batches} batches of a pass of {stage.module.stage}"
@@ -90,6 +90,16 @@ def check_trainers(plan: Plan, config: DictConfig) -> None:
             ("check_val_every_n_epoch", passes, passes == 1),
         ):
             require(each or not waits, f"trainer.{name}", value, allowed)
+
+
+def processes_of(config: DictConfig) -> tuple[int, int]:
+    """Number of this process, and how many train together, by the settings of the trainer."""
+    try:
+        settings = {**_settings(config.trainer), "max_epochs": 1, "logger": False, "enable_checkpointing": False}
+        trainer: pl.Trainer = instantiate(settings, _convert_="all")
+    except (MisconfigurationException, RuntimeError) as error:
+        raise UserError(f"trainer: {explain(error)}") from error
+    return trainer.global_rank, trainer.world_size
 
 
 def trainer_of(stage: Stage, config: DictConfig, folder: RunFolder, loggers: list[Logger]) -> pl.Trainer:

@@ -71,6 +71,9 @@ class Batches:
     then split evenly into the fewest chunks that hold at most ``chunk_size``. All processes have the same
     number of chunks in a step. No image is repeated or left out.
 
+    Where each process holds images of its own, a pass has as many steps as if one held all, and each process gives
+    each step an equal share of its own: a share of a step's mean is as large as the images in it are many.
+
     Args:
         v: Intensities, or data as ``units`` keep them, ``(*replicas, n, n_sites)``; :class:`SparseRows` without
             replica axes. NaN is a missing value.
@@ -88,6 +91,8 @@ class Batches:
         at: Places of the images among those of ``v`` and ``observed``, which then have no replica axes,
             ``(*replicas, n)``; ``label`` and ``weight`` are those of the places. None takes all images.
         check: Whether values that the units do not take are looked for, once; data modules have done it.
+        held: Images that each of the processes holds, where ``v`` and all else are those of this one; None where
+            each holds all images.
 
     Raises:
         SettingError: Sizes that do not fit, or a value that the units do not take, by its column and row.
@@ -112,6 +117,7 @@ class Batches:
         units: Units | None = None,
         at: Tensor | None = None,
         check: bool = True,
+        held: Sequence[int] | None = None,
     ) -> None:
         filled = len(v.shape) >= 2 and v.shape.numel() > 0
         require(filled, "v.shape", tuple(v.shape), "(*replicas, n, n_visible), not empty")
@@ -125,14 +131,17 @@ class Batches:
         require_count("world_size", world_size)
         require_count("rank", rank, minimum=0)
         require(rank < world_size, "rank", rank, f"an integer from 0 to {world_size - 1} (world_size - 1)")
-        self._chunks = _plan(n, batch_size, chunk_size, rank, world_size)
+        if held is not None:
+            fits = len(held) == world_size and held[rank] == n
+            require(fits, "held", list(held), f"a number for each of {world_size} processes, of this one {n}")
+        self._chunks = _plan(n, batch_size, chunk_size, rank, world_size, held)
         if weight is not None:
             fits = weight.shape == label.shape == (n,)
             require(fits, "weight.shape", tuple(weight.shape), f"{(n,)}: a weight an image, without replica axes")
             smallest = float(weight.min())
             require(smallest > 0, "weight", smallest, "numbers > 0", "Leave out images that do not count.")
         # One chunk that is the whole pass: the order cannot matter, and the tensors go out uncopied.
-        self._shuffle = shuffle and (len(self._chunks) > 1 or world_size > 1)
+        self._shuffle = shuffle and (len(self._chunks) > 1 or (world_size > 1 and held is None))
         sparse = isinstance(v, SparseRows)
         fits = not sparse or (observed is None and units is None and at is None)
         require(fits, "observed, units and at", "given", "None where images are in sparse rows")
@@ -148,7 +157,8 @@ class Batches:
         if self._shuffle:
             self._v, self._label = v if isinstance(v, SparseRows) else v.contiguous(), label.contiguous()
             self._observed = None if observed is None else observed.contiguous()
-        self._world_size = world_size
+        self._world_size, self._held, self._rank = world_size, held, rank
+        self._of_steps: list[float] | None = None
         self._seeds: tuple[int, ...] = (seed,)
         self._replicas = tuple(label.shape[:-1])
         self._epoch = 0
@@ -217,6 +227,7 @@ class Batches:
         resume, self._resume = self._resume, None
         start = resume["position"] % len(self) if resume and resume["epoch"] == self._epoch else 0
         order = self._order() if self._shuffle else None
+        self._of_steps = self._weights_of_steps(order)
         for position, chunk in enumerate(self._chunks[start:], start + 1):
             self._progress = {"epoch": self._epoch, "position": position}
             yield self._batch(chunk, order)
@@ -249,9 +260,20 @@ class Batches:
         if self._weight is None:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
         weights = self._weight if order is None else self._weight[order]
-        weight, of_step = weights[..., positions], weights[..., chunk.step]
-        share = self._world_size * float(weight.sum()) / float(of_step.sum())  # alike for all seeds
+        weight = weights[..., positions]
+        of_step = self._of_steps[chunk.number] if self._of_steps else float(weights[..., chunk.step].sum())
+        share = self._world_size * float(weight.sum()) / of_step  # alike for all seeds
         return Batch(v, label, share, chunk.closes_step, weight, observed)
+
+    def _weights_of_steps(self, order: Tensor | None) -> list[float]:
+        """Sum of the weights of each step over all processes, where each knows its own alone."""
+        if self._weight is None or self._held is None:
+            return []
+        weights = self._weight if order is None else self._weight[order]
+        own = [float(weights[chunk.step].double().sum()) for chunk in self._chunks if chunk.closes_step]
+        of_all: list[list[float]] = [own] * self._world_size
+        torch.distributed.all_gather_object(of_all, own)
+        return [sum(of_step) for of_step in zip(*of_all, strict=True)]
 
     def _labels(self, positions: slice, index: Tensor | None) -> Tensor:
         if index is None:
@@ -264,7 +286,9 @@ class Batches:
         first_rows = range(0, math.prod(replicas) * n, n)
         orders = {}
         for seed in dict.fromkeys(self._seeds):
-            generator = rng.stream(seed, "data_order", self._epoch)
+            # Of images of its own each process has an order of its own.
+            name = "data_order" if self._held is None else f"data_order of process {self._rank}"
+            generator = rng.stream(seed, name, self._epoch)
             # On the generator's device, whatever torch's default device is.
             orders[seed] = torch.stack(
                 [torch.randperm(n, generator=generator, device="cpu") + first for first in first_rows]
@@ -274,12 +298,13 @@ class Batches:
 
 
 class _Chunk(NamedTuple):
-    """Positions in the order, of the chunk and of its whole step."""
+    """Positions in the order, of the chunk and of its whole step, which has a number in the pass."""
 
     positions: slice
     step: slice
     share: float
     closes_step: bool
+    number: int
 
 
 def _check_values(units: Units, v: Tensor, observed: Tensor | None) -> None:
@@ -308,24 +333,52 @@ def _taken(v: Tensor, positions: slice, index: Tensor | None) -> Tensor:
     return v.flatten(0, -2).index_select(0, index.flatten()).view(*index.shape, -1)
 
 
-def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size: int) -> list[_Chunk]:
+def _plan(
+    n: int, batch_size: int | None, chunk_size: int, rank: int, world_size: int, held: Sequence[int] | None
+) -> list[_Chunk]:
     """Return which positions of the order form each chunk of this process."""
     plan = []
-    for start in range(0, n, batch_size or n):
-        step = range(start, min(start + (batch_size or n), n))
-        n_chunks = math.ceil(math.ceil(len(step) / world_size) / chunk_size)
+    dealt = _of_all(n, batch_size, rank, world_size) if held is None else _of_own(held, batch_size, rank)
+    for number, (shard, step, n_images, fewest, most) in enumerate(dealt):
+        n_chunks = math.ceil(most / chunk_size)
         # An empty chunk is refused: the mean over it is NaN.
-        allowed = f"at least one image for each process in every step, but a step has {len(step)} images for "
+        allowed = f"at least one image for each process in every step, but a step has {n_images} images for "
         allowed += f"{world_size} processes"
         remedy = "Choose a batch_size that leaves more in the last step, or use fewer processes."
-        require(len(step) >= world_size, "batch_size", batch_size, allowed, remedy)
-        allowed = f"an integer >= 2, because {world_size} processes share a step of {len(step)} images unevenly"
-        require(len(step) // world_size >= n_chunks, "chunk_size", chunk_size, allowed)
-        shard = step[rank::world_size]
+        require(fewest > 0, "batch_size", batch_size, allowed, remedy)
+        allowed = f"an integer >= 2, because {world_size} processes share a step of {n_images} images unevenly"
+        require(fewest >= n_chunks, "chunk_size", chunk_size, allowed)
         bounds = [k * len(shard) // n_chunks for k in range(n_chunks + 1)]
         for k in range(n_chunks):
             part = shard[bounds[k] : bounds[k + 1]]
             positions = slice(part.start, part.stop, part.step)
-            share = world_size * len(part) / len(step)
-            plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1))
+            share = world_size * len(part) / n_images
+            plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1, number))
     return plan
+
+
+class _Dealt(NamedTuple):
+    """A step: positions of this process, those that its weights add up over; images of all processes, of each."""
+
+    shard: range
+    step: range
+    n_images: int
+    fewest: int
+    most: int
+
+
+def _of_all(n: int, batch_size: int | None, rank: int, world_size: int) -> Iterator[_Dealt]:
+    """Steps of images that each process holds all of: it takes every n-th."""
+    for start in range(0, n, batch_size or n):
+        step = range(start, min(start + (batch_size or n), n))
+        fewest, most = len(step) // world_size, math.ceil(len(step) / world_size)
+        yield _Dealt(step[rank::world_size], step, len(step), fewest, most)
+
+
+def _of_own(held: Sequence[int], batch_size: int | None, rank: int) -> Iterator[_Dealt]:
+    """Steps of images that each process has its own of: an equal part of them, to one image."""
+    n_steps = math.ceil(sum(held) / (batch_size or sum(held)))
+    for k in range(n_steps):
+        shards = [range(k * n // n_steps, (k + 1) * n // n_steps) for n in held]
+        sizes = [len(shard) for shard in shards]
+        yield _Dealt(shards[rank], shards[rank], sum(sizes), min(sizes), max(sizes))

@@ -11,7 +11,7 @@ from memcomp_lightning import defaults, rng
 from memcomp_lightning.data.images import ImageData, PixelLayout
 from memcomp_lightning.data.labels import with_label, with_labels
 from memcomp_lightning.data.loading import Batches
-from memcomp_lightning.data.rows import UNLABELLED, Part, Rows
+from memcomp_lightning.data.rows import UNLABELLED, Origin, Part, Rows, Share
 from memcomp_lightning.data.schema import ImageSchema, Schema
 from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models.units import Bernoulli, Units
@@ -64,6 +64,9 @@ class RowsDataModule(LightningDataModule):
         partition_seed: Seed of the partition and of the held-out rows.
         labels: Take the rows that have a label alone, ``"all"`` or so many of them for each replica, of each class
             its share; the held-out share of these is held out. None takes all rows.
+        share: Of all rows that this process holds: ``train`` and ``test`` are its own alone, and which rows are
+            held out does not depend on the number of processes. None where it holds all.
+        origin: Several files that the rows are from, by which they are told from others; None goes by all numbers.
     """
 
     most_numbers: ClassVar[int | None] = None
@@ -87,6 +90,8 @@ class RowsDataModule(LightningDataModule):
         seed: int = 0,
         partition_seed: int = 0,
         labels: int | Literal["all"] | None = None,
+        share: Share | None = None,
+        origin: Origin | None = None,
     ) -> None:
         super().__init__()
         self.units, self.n_classes, self.data_name, self.pixel_layout = units, n_classes, name, pixel_layout
@@ -96,7 +101,11 @@ class RowsDataModule(LightningDataModule):
         remedy = "Rows with weights are not dealt into parts: type data.similarity=null where they are sequences, "
         remedy += "or data.columns={NAME: ignore} where a column of a table holds them."
         require(partitions == 1 or train.weight is None, "partitions", partitions, "1", remedy)
-        n_part, n_held_out = _split(train.n, partitions, validation_fraction, partition_seed)
+        remedy = "Join the files into one, which each process holds whole."
+        require(share is None or partitions == 1, "partitions", partitions, "1 where processes share rows", remedy)
+        require(share is None or labels is None, "labels", labels, "none where processes share rows", remedy)
+        n_all = train.n if share is None else len(share.train)
+        n_part, n_held_out = _split(n_all, partitions, validation_fraction, partition_seed)
         n_parts = partitions
         if first_partitions is not None:
             require_count("first_partitions", first_partitions)
@@ -107,10 +116,23 @@ class RowsDataModule(LightningDataModule):
         at = heldout_at = None
         if partitions > 1 or n_held_out:
             generator = rng.stream(partition_seed, "partition")
-            order = torch.randperm(train.n, generator=generator, device=generator.device)
+            order = torch.randperm(n_all, generator=generator, device=generator.device)
             order = order[: n_parts * n_part].view(*self.replicas, n_part)
             at = order[..., : n_part - n_held_out]
             heldout_at = order[..., n_part - n_held_out :] if n_held_out else None
+        self._share, self._origin = share, origin
+        self._held: list[int] | None = None
+        if share is not None:
+            self.n_train = n_all if at is None else at.shape[-1]
+            self._some_at = [_which(share.some_at, places, n_all) for places in (at, heldout_at)]
+            self._held = share.held(share.train if at is None else share.train[at])
+            self._held_out = None if heldout_at is None else share.held(share.train[heldout_at])
+            at, heldout_at = (None if places is None else share.own(places) for places in (at, heldout_at))
+            sets = {"validation_fraction": self._held_out}
+            sets |= {"test_fraction": None if share.test is None else share.held(share.test)}
+            for setting, each in sets.items():
+                allowed = f"a share of which each process holds a row; theirs are {each}"
+                require(each is None or min(each) > 0, f"data.{setting}", "too small", allowed)
         self.n_labels: int | None = None
         if labels is not None:
             n = None if labels == "all" else labels
@@ -123,8 +145,12 @@ class RowsDataModule(LightningDataModule):
         if validation is not None:
             what = "rows of data.validation"
             self._heldout = Part(validation) if labels is None else with_label(validation, what)
-        self.n_train = self._train.n
-        self.train_batches(rank=0, world_size=1)
+        if share is None:
+            self.n_train = self._train.n
+            self.train_batches(rank=0, world_size=1)
+        else:
+            self.train_batches(share.rank, share.n_processes)
+            self.val_dataloader()
 
     @property
     def schema(self) -> Schema | None:
@@ -183,7 +209,7 @@ class RowsDataModule(LightningDataModule):
         parts = {"train": self._train, "test": self._test}
         if self.holds_out:
             parts["held-out"] = self._heldout
-        return {name: part.rows.fingerprint for name, part in parts.items()}
+        return {name: self._fingerprint(part) for name, part in parts.items()}
 
     @property
     def class_names(self) -> list[str]:
@@ -210,23 +236,42 @@ class RowsDataModule(LightningDataModule):
 
     def some_train(self) -> Rows:
         """Training rows as values of the visible units: of large tables evenly spaced ones."""
+        if self._share is not None:
+            some = self._share.some_train.at(self._some_at[0])
+            return some._replace(v=self._values(some)[0], observed=self._mask(some))
         step = 1 if self.most_numbers is None else -(-self.n_train * self.n_visible // self.most_numbers)
         some = self._train.taken(step)
         return some._replace(v=self._values(some)[0], observed=self._mask(some))
 
+    def some_heldout(self) -> tuple[Tensor, Tensor | None]:
+        """The rows of the validation and where they are known; evenly spaced ones where processes share them."""
+        some, share = None, self._share
+        if share is not None and self._heldout.rows is self._train.rows:
+            some = share.some_train.at(self._some_at[1])
+        elif share is not None and self._heldout is self._test:
+            some = share.some_test
+        return (
+            (self.heldout[0], self.heldout_observed) if some is None else (self._values(some)[0], self._mask(some))
+        )
+
     def train_dataloader(self) -> Batches:
         """Return the shuffled training batches of this process."""
         if self.trainer is None:
-            return self.train_batches(rank=0, world_size=1)
+            return self.train_batches(rank=0, world_size=1)  # refused where processes share the rows
         return self.train_batches(self.trainer.global_rank, self.trainer.world_size)
 
     def val_dataloader(self) -> Batches:
         """Return the held-out rows, or the test rows if none are held out."""
-        return self._evaluation_batches(self._heldout)
+        if self._heldout is self._test:
+            return self.test_dataloader()
+        shared = self._share is not None and self._heldout.rows is self._train.rows
+        return self._evaluation_batches(self._heldout, self._held_out if shared else None)
 
     def test_dataloader(self) -> Batches:
         """Return the test rows, the same for every replica."""
-        return self._evaluation_batches(self._test)
+        holder = None if self._share is None else self._share.test
+        held = None if self._share is None or holder is None else self._share.held(holder)
+        return self._evaluation_batches(self._test, held)
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
         """Nothing for batches that are there already; Lightning would look for tensors in each field."""
@@ -236,6 +281,10 @@ class RowsDataModule(LightningDataModule):
 
     def train_batches(self, rank: int, world_size: int) -> Batches:
         """Return the shuffled training batches of one of ``world_size`` processes."""
+        if self._share is not None:
+            own = (self._share.rank, self._share.n_processes)
+            allowed = f"{own}: this is process {own[0]} of {own[1]}, which holds a share of the rows"
+            require((rank, world_size) == own, "rank and world_size", (rank, world_size), allowed)
         return Batches(
             self._train.rows.v,
             self._train.label,
@@ -245,6 +294,7 @@ class RowsDataModule(LightningDataModule):
             seed=self._seed,
             rank=rank,
             world_size=world_size,
+            held=self._held,
             observed=self._train.rows.observed,
             weight=self._train.weight,
             units=self.units,
@@ -252,7 +302,7 @@ class RowsDataModule(LightningDataModule):
             check=False,
         )
 
-    def _evaluation_batches(self, part: Part) -> Batches:
+    def _evaluation_batches(self, part: Part, held: list[int] | None) -> Batches:
         v, observed, label, at = part.rows.v, part.rows.observed, part.label, part.at
         if label.ndim == 1:
             label = label.expand(*self.replicas, -1)
@@ -263,7 +313,15 @@ class RowsDataModule(LightningDataModule):
                 at = at.expand(*self.replicas, -1)
         settings: dict[str, Any] = {"chunk_size": self._chunk_size, "shuffle": False, "seed": self._seed}
         settings |= {"observed": observed, "weight": part.weight, "units": self.units, "at": at, "check": False}
+        if held is not None and self._share is not None:
+            settings |= {"rank": self._share.rank, "world_size": self._share.n_processes, "held": held}
         return Batches(v, label, None, **settings)
+
+    def _fingerprint(self, part: Part) -> str:
+        origin = self._origin
+        if origin is not None and (part.rows is self._train.rows or (part is self._test and origin.splits)):
+            return origin.fingerprint
+        return part.rows.fingerprint
 
     def _values(self, kept: Rows) -> tuple[Tensor, Tensor]:
         return self.units.encode(kept.v, check=False), kept.label
@@ -323,6 +381,7 @@ class TableDataModule(RowsDataModule):
     def __init__(self, table: "TableData | SequenceData", **settings: Any) -> None:
         own: dict[str, Any] = {"n_classes": table.n_classes, "name": table.name, "pixel_layout": table.layout}
         own |= {"validation": table.validation, "units": table.units()}
+        own |= {name: getattr(table, name, None) for name in ("share", "origin")}
         super().__init__(table.train, table.test, **own, **settings)
         self.table = table
 
@@ -370,6 +429,15 @@ class TableDataModule(RowsDataModule):
             settings: Of the class.
         """
         return cls(_data_of(array, label, columns=columns, test_fraction=test_fraction), **settings)
+
+
+def _which(some_at: Tensor, at: Tensor | None, n: int) -> Tensor:
+    """Which of some of n rows have places among these; None is all places."""
+    if at is None:
+        return torch.ones_like(some_at, dtype=torch.bool)
+    known = torch.zeros(n, dtype=torch.bool, device="cpu")
+    known[at] = True
+    return known[some_at]
 
 
 def _data_of(*arguments: Any, **settings: Any) -> "TableData":

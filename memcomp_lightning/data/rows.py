@@ -1,8 +1,13 @@
 """Some rows of a data set, as the visible units keep them."""
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from memcomp_lightning.types import UNLABELLED as UNLABELLED  # for all that reads rows
@@ -44,6 +49,63 @@ class Rows(NamedTuple):
 
 _ROWS = 2**14
 """That are looked at together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Share:
+    """What a process knows of the rows that others hold, where each of several holds some of a data set.
+
+    Attributes:
+        rank: Number of the process.
+        n_processes: How many there are.
+        train, test: Which process holds each row, int16, ``(n,)``; those of a process are in this order in its
+            :class:`Rows`. ``test`` is None where each process holds all test rows.
+        some_train, some_test: Evenly spaced rows of all.
+        some_at: Which training rows the first of them are, ``(n_some,)``.
+    """
+
+    rank: int
+    n_processes: int
+    train: Tensor
+    test: Tensor | None
+    some_train: Rows
+    some_test: Rows | None
+    some_at: Tensor
+
+    def held(self, holder: Tensor) -> list[int]:
+        """How many of the rows with these holders each process has."""
+        return torch.bincount(holder.long(), minlength=self.n_processes).tolist()
+
+    def own(self, at: Tensor) -> Tensor:
+        """Places among the training rows of this process of those that it has of ``at``, places among all."""
+        mine = self.train == self.rank
+        place = mine.cumsum(0) - 1
+        return place[at[mine[at]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Files that rows were read from, which stand for the rows where nobody may hold all of these.
+
+    Attributes:
+        files: In their order.
+        split: What split the rows into training and test rows.
+        splits: Whether test rows are among them.
+    """
+
+    files: Sequence[Path]
+    split: str
+    splits: bool
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Sixteen digits that stand for all bytes of the files, and how their rows were split."""
+        digest = hashlib.blake2b(self.split.encode(), digest_size=8)
+        for path in self.files:
+            with path.open("rb") as file:
+                while some := file.read(2**20):
+                    digest.update(some)
+        return digest.hexdigest()
 
 
 class Part(NamedTuple):

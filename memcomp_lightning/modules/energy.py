@@ -313,7 +313,9 @@ class EnergyPretraining(StageModule):
         if self._state.sampler is None and self.earlier is not None:
             self._go_on(step, positive.v.shape[-2])
         if self.trainer.world_size > 1:  # the processes add their gradients up in the backward pass
-            gap, negative, state = step.contrast(model, positive, self._state, generator=generator)
+            gap, negative, state = step.contrast(
+                model, positive, self._state, share=batch.share, generator=generator
+            )
             loss = step.loss(model, gap, batch.share)
         else:
             followed = step.add_gradient(model, positive, self._state, share=batch.share, generator=generator)
@@ -390,11 +392,14 @@ class _OfTrainer(Processes):
     def __init__(self, trainer: pl.Trainer, device: torch.device) -> None:
         self._trainer, self._device = trainer, device
 
-    def means(self, values: Sequence[Tensor]) -> Sequence[Tensor]:
+    def means(self, values: Sequence[Tensor], share: float | None = None) -> Sequence[Tensor]:
         """All of them in one message; Lightning would send each by itself, with a barrier before it."""
         together = torch.cat([value.reshape(-1) for value in values])
+        if share is not None:
+            together = torch.cat([share * together, together.new_full((1,), share)])
         torch.distributed.all_reduce(together)
-        parts = (together / self._trainer.world_size).split([value.numel() for value in values])
+        n = self._trainer.world_size if share is None else together[-1]
+        parts = (together / n)[: sum(value.numel() for value in values)].split([value.numel() for value in values])
         return [part.view_as(value) for part, value in zip(parts, values, strict=True)]
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:

@@ -191,8 +191,8 @@ def _record(stage: Stage) -> dict[str, Any]:
 def _context(plan: Plan, result: dict[str, Any]) -> dict[str, Any]:
     """What simple models reach on the same data; of several parts of the training set, on the first."""
     data = plan.stages[0].data
-    (train, _, observed, _), (heldout, _) = data.some_train(), data.heldout
-    masks = {"train_observed": observed, "observed": data.heldout_observed}
+    (train, _, observed, _), (heldout, known) = data.some_train(), data.some_heldout()
+    masks = {"train_observed": observed, "observed": known}
     if data.replicas:
         train = train[0]
         heldout = heldout if heldout.ndim == 2 else heldout[0]

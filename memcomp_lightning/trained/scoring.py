@@ -39,6 +39,7 @@ class Scores:
         log_z: Log Z and how it was found; None where there is no likelihood.
         seconds: That it took to find it.
         accuracy: Share of the labelled rows that have a class whose class is right; None without any.
+        n_judged: How many these are.
         notes: What was left out, and why, a sentence each.
     """
 
@@ -47,11 +48,18 @@ class Scores:
     seconds: float
     accuracy: float | None
     notes: list[str]
+    n_judged: int = 0
 
 
 @torch.no_grad()
 def score(
-    run: Run, rows: Rows, *, pseudo: bool = True, annealing: Annealing | None = None, seed: int = 0
+    run: Run,
+    rows: Rows,
+    *,
+    pseudo: bool = True,
+    annealing: Annealing | None = None,
+    log_z: LogZ | None = None,
+    seed: int = 0,
 ) -> Scores:
     r"""Score rows, as columns.
 
@@ -70,6 +78,7 @@ def score(
         rows: To score; whole rows may be missing.
         pseudo: Whether pseudo-likelihoods are computed; of many real columns they take longest.
         annealing: Settings of AIS.
+        log_z: Log Z, where it is known; None finds it.
         seed: Of what is drawn.
 
     Raises:
@@ -80,7 +89,7 @@ def score(
     whole = torch.ones(len(v), dtype=torch.bool) if rows.observed is None else rows.observed.all(-1)
     columns: Columns = {"row": np.arange(1, len(v) + 1)}
     notes: list[str] = []
-    log_z, seconds = None, 0.0
+    seconds = 0.0
     try:
         model = run.model
         model.visible.check(v, observed, pure=True)
@@ -91,18 +100,18 @@ def score(
     else:
         begin = time.perf_counter()
         try:
-            log_z = log_z_of(model, annealing=annealing, seed=seed)
+            log_z = log_z or log_z_of(model, annealing=annealing, seed=seed)
         except UserError as error:
             notes.append(f"no log_likelihood: {error}")
         seconds = time.perf_counter() - begin
         columns |= _likelihoods(run, model, _Given(rows, v, observed, whole), log_z, notes, seed)
         if pseudo:
             columns |= _pseudo_likelihoods(run, model, v, whole, notes)
-    accuracy = None
+    accuracy, n_judged = None, 0
     if run.classifier is not None:
-        of_classes, accuracy = _classes(run, _Given(rows, v, observed, whole), notes, seed)
+        of_classes, accuracy, n_judged = _classes(run, _Given(rows, v, observed, whole), notes, seed)
         columns |= of_classes
-    return Scores(columns, log_z, seconds, accuracy, notes)
+    return Scores(columns, log_z, seconds, accuracy, notes, n_judged)
 
 
 @torch.no_grad()
@@ -177,8 +186,8 @@ def _pseudo_likelihoods(run: Run, model: EnergyModel, v: Tensor, whole: Tensor, 
     return {"pseudo_log_likelihood": found.numpy()}
 
 
-def _classes(run: Run, given: _Given, notes: list[str], seed: int) -> tuple[Columns, float | None]:
-    """Probabilities of the classes, the likeliest one, and the share that is right."""
+def _classes(run: Run, given: _Given, notes: list[str], seed: int) -> tuple[Columns, float | None, int]:
+    """Probabilities of the classes, the likeliest one, and the share that is right of so many rows."""
     rows, v, observed, whole = given
     names, known = run.needed_schema.class_names, whole.clone()
     p = torch.full((len(v), len(names)), torch.nan)
@@ -202,7 +211,7 @@ def _classes(run: Run, given: _Given, notes: list[str], seed: int) -> tuple[Colu
     columns: Columns = {f"p({name})": p[:, k].numpy() for k, name in enumerate(names)}
     judged = known & (rows.label != UNLABELLED)
     right = float((best == rows.label)[judged].double().mean()) if bool(judged.any()) else math.nan
-    return columns | {"class": of_class}, None if math.isnan(right) else right
+    return columns | {"class": of_class}, None if math.isnan(right) else right, int(judged.sum())
 
 
 def _of_data(run: Run) -> EnergyModel | None:

@@ -20,8 +20,8 @@ Sampler: TypeAlias = NegativePhaseSampler[Any, Any]
 class Processes:
     """The processes that share an update, each with images of its own: here one, alone."""
 
-    def means(self, values: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The mean of each value over all of them."""
+    def means(self, values: Sequence[Tensor], share: float | None = None) -> Sequence[Tensor]:
+        """The mean of each value over all of them, in which this one counts by its share; None is all alike."""
         return values
 
     def from_first(self, make: Callable[[], NegativePhase[object]]) -> NegativePhase[object]:
@@ -70,7 +70,13 @@ class EnergyStep:
         require_sampler("sampler", self.sampler)
 
     def contrast(
-        self, model: EnergyModel, positive: Configurations, state: StepState, *, generator: Generator
+        self,
+        model: EnergyModel,
+        positive: Configurations,
+        state: StepState,
+        *,
+        share: float = 1.0,
+        generator: Generator,
     ) -> tuple[Tensor, NegativePhase[object], StepState]:
         """Return the contrast ``(*replicas,)``, whose gradient is followed, the negative phase, and the new state.
 
@@ -78,9 +84,10 @@ class EnergyStep:
             model: The energy model; not changed.
             positive: The positive phase of the batch, with its weights.
             state: What the call before returned, ``after_update()`` where the update was complete.
+            share: Of the batch, as for :meth:`loss`: how far it counts in centres that processes share.
             generator: Of the negative phase.
         """
-        negative, state = self._begun(model, positive, state, generator)
+        negative, state = self._begun(model, positive, state, share, generator)
         return contrast(model, positive, negative.configurations, state.offsets), negative, state
 
     def add_gradient(
@@ -98,7 +105,7 @@ class EnergyStep:
         ``share`` is that of the batch, as for :meth:`loss`. With ``valued=False`` nobody looks at the contrast,
         and None may be in its place.
         """
-        negative, state = self._begun(model, positive, state, generator)
+        negative, state = self._begun(model, positive, state, share, generator)
         gap = add_gradient(model, positive, negative.configurations, state.offsets, share=share, valued=valued)
         if self.penalties:
             self.loss(model, torch.zeros_like(model.b[..., 0]), share).backward()
@@ -118,12 +125,12 @@ class EnergyStep:
         return share * with_penalties(gap, model, self.penalties).sum()
 
     def _begun(
-        self, model: EnergyModel, positive: Configurations, state: StepState, generator: Generator
+        self, model: EnergyModel, positive: Configurations, state: StepState, share: float, generator: Generator
     ) -> tuple[NegativePhase[object], StepState]:
         """The negative phase for a batch, and the state after it."""
         offsets, negative = state.offsets, state.negative
         if negative is None and self.centring is not None:
-            offsets = Offsets(*self.processes.means(self.centring.follow(offsets, positive)))
+            offsets = Offsets(*self.processes.means(self.centring.follow(offsets, positive), share))
         if negative is None or self.sampler.uses_data:
             negative = self._negative_phase(model, positive, state.sampler, generator)
         return negative, StepState(negative.state, offsets, negative)

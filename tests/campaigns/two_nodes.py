@@ -33,7 +33,7 @@ HANGS_AFTER = 240
 """Seconds after which a run is given up."""
 
 WORKER = Path(__file__).with_name("two_nodes_worker.py")
-MODELS = ("cd", "pcd", "mode_assisted", "categories")
+MODELS = ("cd", "pcd", "mode_assisted", "categories", "shared table")
 COSTS = ("cd 784x500", "pcd 784x500", "ground_state 784x500", "cd 784x4096")
 
 
@@ -185,7 +185,7 @@ class Cost:
 
     Attributes:
         gradient: Bytes of the gradient: of all parameters of the stage.
-        offsets: Bytes of the centres of the units.
+        offsets: Bytes of the centres of the units, and of how much they count.
         gap: Bytes of the energy gap.
         answer: Bytes that the first process sends to all others, of a sampler that answers for all of them.
         signal: Bytes by which Lightning lets the first process tell the others that it has been asked to end.
@@ -200,7 +200,9 @@ class Cost:
     @classmethod
     def of(cls, n_visible: int, n_hidden: int, *, shared: bool = False) -> "Cost":
         units = n_visible + n_hidden
-        return cls(4 * (n_visible * n_hidden + units), 4 * units, answer=8 * units + PICKLED if shared else 0)
+        return cls(
+            4 * (n_visible * n_hidden + units), 4 * (units + 1), answer=8 * units + PICKLED if shared else 0
+        )
 
     @property
     def operations(self) -> int:

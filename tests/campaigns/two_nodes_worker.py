@@ -1,10 +1,11 @@
 """What two_nodes.py starts in each process: a training whose weights are kept, or whose messages are counted."""
 
 import json
+import os
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -15,6 +16,7 @@ from torch import Generator, Tensor
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 
 from memcomp_lightning import rng
+from memcomp_lightning.data import Batches, Table, TableDataModule
 from memcomp_lightning.data.module import RowsDataModule
 from memcomp_lightning.data.rows import Rows
 from memcomp_lightning.models import DBN
@@ -24,7 +26,7 @@ from memcomp_lightning.objective import shares
 from memcomp_lightning.samplers import CD, PCD, GroundState, ModeAssisted, ModeSchedule
 from memcomp_lightning.solvers import AlternatingDescent
 from memcomp_lightning.training import Greedy
-from memcomp_lightning.types import Configurations, NegativePhase, NoState
+from memcomp_lightning.types import Batch, Configurations, NegativePhase, NoState
 
 N_ROWS, BATCH, PASSES, SEED = 96, 48, 6, 0
 SIZES = (3, 4, 2, 5)
@@ -48,6 +50,7 @@ class AsSeveral:
 
     def __init__(self, sampler: Any, n: int) -> None:
         self.sampler, self.n, self.uses_data = sampler, n, sampler.uses_data
+        self.sizes: list[int] | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -61,13 +64,78 @@ class AsSeveral:
         self, model: Any, state: States, positive: Configurations, *, generator: Generator
     ) -> NegativePhase[Any]:
         found = []
-        for rank, (own, numbers) in enumerate(zip(state, self.generators, strict=False)):
-            part = Configurations(positive.v[rank :: self.n], positive.h[rank :: self.n])
-            found.append(self.sampler.sample(model, own, part, generator=numbers))
+        of_each = list(zip(self._dealt(positive.v), self._dealt(positive.h), strict=True))
+        for (v, h), own, numbers in zip(of_each, state, self.generators, strict=False):
+            found.append(self.sampler.sample(model, own, Configurations(v, h), generator=numbers))
         parts = [one.configurations for one in found]
+        weight = torch.cat(
+            [shares(part) * len(v) / len(positive.v) for part, (v, _) in zip(parts, of_each, strict=True)]
+        )
         v, h = torch.cat([part.v for part in parts]), torch.cat([part.h for part in parts])
-        weight = torch.cat([shares(part) for part in parts]) / self.n
         return NegativePhase(Configurations(v, h, weight), States(*(one.state for one in found)), {})
+
+    def _dealt(self, x: Tensor) -> Sequence[Tensor]:
+        """Rows of each process: every n-th, or so many one after the other."""
+        return [x[rank :: self.n] for rank in range(self.n)] if self.sizes is None else x.split(self.sizes)
+
+
+# ------------------------------------------------------------------------------------------------- a shared table
+
+
+N_SHARED = (3, 90, 40, 1, 69)
+"""Rows of the files of the table that is shared: processes hold blocks of them."""
+
+
+def write_parts(folder: Path) -> None:
+    """A table of bits, words and numbers in files of their own."""
+    folder.mkdir(exist_ok=True)
+    draw = rng.stream(0, "table")
+    for number, n in enumerate(N_SHARED):
+        group = torch.randint(2, (n, 1), generator=draw)
+        bits = (rng.uniform((n, 14), generator=draw) < 0.3 + 0.4 * group).int()
+        x = group + 3 * rng.uniform((n, 2), generator=draw) + number
+        words = [
+            ["red", "green", "blue"][k] for k in (torch.randint(2, (n,), generator=draw) + group[:, 0]).tolist()
+        ]
+        lines = [",".join([*(f"b{k}" for k in range(14)), "x0", "x1", "word"])]
+        lines += [
+            ",".join(map(str, [*b, *y, w])) for b, y, w in zip(bits.tolist(), x.tolist(), words, strict=True)
+        ]
+        (folder / f"{number}.csv").write_text("\n".join(lines) + "\n")
+
+
+def share_of(rank: int, n: int) -> TableDataModule:
+    """The rows of a process, where n share the table."""
+    table = Table(path="parts", share=(rank, n)).load()
+    return TableDataModule(table, batch_size=40, validation_fraction=0.1, seed=SEED)
+
+
+class OfAll:
+    """In one process, the batches of n processes that share a table, each update's as one."""
+
+    batch_sampler: ClassVar[None] = None
+
+    def __init__(self, n: int, sampler: AsSeveral) -> None:
+        self.batches: list[Batches] = [share_of(rank, n).train_batches(rank, n) for rank in range(n)]
+        self.of_sampler = sampler
+
+    @property
+    def sampler(self) -> "OfAll":
+        """Where Lightning says which pass begins."""
+        return self
+
+    def set_epoch(self, epoch: int) -> None:
+        for batches in self.batches:
+            batches.set_epoch(epoch)
+
+    def __len__(self) -> int:
+        return len(self.batches[0])
+
+    def __iter__(self) -> Iterator[Batch]:
+        for parts in zip(*self.batches, strict=True):
+            self.of_sampler.sizes = [len(part.label) for part in parts]
+            v, label = torch.cat([part.v for part in parts]), torch.cat([part.label for part in parts])
+            yield Batch(v, label, 1.0, True, None, None)
 
 
 def case(model: str) -> tuple[Units, Any, Tensor]:
@@ -105,8 +173,15 @@ def trainer_of(n: int, n_epochs: int, **settings: Any) -> pl.Trainer:
 def weights(model: str, n: int, place: Path, *, together: bool) -> None:
     """Train in both precisions; keep the weights."""
     kept: dict[str, Any] = {"updates": 0}
+    shared = model == "shared table"
+    if shared and not together:
+        write_parts(Path("parts"))
     for precision in ("32-true", "64-true"):
-        units, sampler, rows = case(model)
+        if shared:
+            own_rows = share_of(int(os.environ["RANK"]) if together else 0, n)
+            units, sampler, rows = own_rows.units, PCD(n_chains=8), torch.empty(0)
+        else:
+            units, sampler, rows = case(model)
         dbn = DBN(visible=units, hidden_sizes=[8, 6], generator=rng.stream(0, "weights"))
         kept["begin"] = {name: tensor.clone() for name, tensor in dbn.state_dict().items()}
         own = sampler if together else AsSeveral(sampler, n)
@@ -114,7 +189,12 @@ def weights(model: str, n: int, place: Path, *, together: bool) -> None:
         if not together:
             own.begin()
         trainer = trainer_of(n if together else 1, 2 * PASSES, precision=precision)
-        trainer.fit(module, datamodule=data_of(units, rows, BATCH))
+        if not shared:
+            trainer.fit(module, datamodule=data_of(units, rows, BATCH))
+        elif together:
+            trainer.fit(module, datamodule=own_rows)
+        else:
+            trainer.fit(module, OfAll(n, own))
         kept[precision] = dbn.state_dict()
         kept["updates"] = trainer.global_step
         first = trainer.is_global_zero

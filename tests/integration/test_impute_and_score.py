@@ -381,3 +381,32 @@ def test_the_schema_is_not_that_of_the_run(memcomp_impute: Command, run: str) ->
     outcome = memcomp_impute(run, "gaps.csv")
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1
+
+
+def test_files_of_a_table_are_scored_one_after_the_other(memcomp_score: Command, run: str) -> None:
+    """The rows of all of them, as if they were one; log Z is found once."""
+    Path("parts").mkdir()
+    table = gappy()
+    for name, some in (("a", people()[:3]), ("b", table[3:200]), ("c", table[200:])):
+        some.to_csv(f"parts/{name}.csv", index=False)
+    pd.concat([people()[:3], table[3:]]).to_csv("all.csv", index=False)
+    whole = memcomp_score(run, "all.csv", "output=whole.csv")
+    assert whole.status == 0, whole.err
+    for path in ("parts", "parts/*.csv"):
+        outcome = memcomp_score(run, path, "output=parts.csv", "overwrite=true")
+        assert outcome.status == 0, outcome.err
+        found, expected = read("parts.csv"), read("whole.csv")
+        assert list(found.columns) == list(expected.columns)
+        for name in ("row", "id", "class"):
+            if name in expected:
+                assert (found[name] == expected[name])[: 3 if name == "class" else None].all()
+        for name in ("log_likelihood", "free_energy"):
+            one, other = (frame[name].replace("", "nan").astype(float) for frame in (found, expected))
+            assert (one.isna() == other.isna()).all()
+            assert ((one - other).abs() < 1e-3).mean() > 0.9, "what is drawn for gaps is drawn for each file"
+        line = next(text for text in whole.out.splitlines() if "300 rows" in text)
+        assert line.split(" ±")[0][:-2] in outcome.out
+    refused = memcomp_score(run, "parts", "figures=looks.png")
+    assert (refused.status, "parts is several files. Leave it out." in refused.err) == (2, True)
+    (Path("parts") / "d.csv").write_text("")
+    assert "d.csv is empty" in memcomp_score(run, "parts", "overwrite=true").err

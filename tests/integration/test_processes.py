@@ -1,6 +1,7 @@
 """Two real processes do the full-batch update of one."""
 
 import json
+import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,6 +40,47 @@ def test_two_processes_give_the_update_of_one(memcomp_train: Run, start_process:
     ]
     assert torch.tensor(gaps[0]) == pytest.approx(torch.tensor(gaps[1]), rel=1e-4)
     assert out.count("test accuracy") == 1, "the table is printed once"
+
+
+def test_two_processes_that_share_a_table_give_the_update_of_one(
+    memcomp_train: Run, start_process: Start, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyarrow")
+    draw = random.Random(0)
+    (tmp_path / "parts").mkdir()
+    for number, n in enumerate((40, 3, 90, 68)):
+        lines = [f"{draw.randint(0, 1)},{draw.gauss(number, 2):.4f},{draw.choice('abc')}" for _ in range(n)]
+        lines[1] = lines[1].replace(lines[1].split(",")[1], "")
+        weights = [f"{line},{1 + number}" for line in lines]
+        (tmp_path / f"parts/{number}.csv").write_text("\n".join(["bit,x,word,w", *weights]) + "\n")
+    run = [
+        "data=table",
+        "data.path=parts/*.csv",
+        "data.columns={weight: w}",
+        "model.hidden_sizes=[3]",
+        "sampler=exact",
+    ]
+    run += ["pretrain.iterations=4", "pretrain.batch_size=null", "pretrain.optimizer.lr=0.5"]
+    run += ["model.weight_init.std=0.5", "data.validation_fraction=0.2", "callbacks=minimal", "logger=none"]
+    one = memcomp_train(*run, "hydra.run.dir=one")
+    assert one.status == 0, one.err
+    two = start_process(*run, "hydra.run.dir=two", "trainer.devices=2", "trainer.strategy=ddp")
+    out, err = two.communicate()
+    assert two.returncode == 0, err
+    assert "181 rows to train on, 20 test rows" in out
+    assert "shared by 2 processes" in out
+    assert "shared by" not in one.out
+    assert (tmp_path / "one/schema.json").read_text() == (tmp_path / "two/schema.json").read_text()
+    expected, found = (
+        torch.load(tmp_path / name / "weights/pretrain.pt", weights_only=True) for name in ("one", "two")
+    )
+    for name, tensor in expected.items():
+        torch.testing.assert_close(found[name], tensor, rtol=1e-4, atol=1e-5)
+    results = [json.loads((tmp_path / name / "result.json").read_text()) for name in ("one", "two")]
+    likelihoods = [result["stages"]["pretrain"]["log_likelihood"][-1]["heldout"] for result in results]
+    assert likelihoods[0] == pytest.approx(likelihoods[1], rel=1e-4)
+    gaps = [result["stages"]["pretrain"]["energy_gap"] for result in results]
+    assert torch.tensor(gaps[0]) == pytest.approx(torch.tensor(gaps[1]), rel=1e-3, abs=1e-5)
 
 
 def test_chains_and_streams_differ_between_processes_and_resume(tmp_path: Path) -> None:

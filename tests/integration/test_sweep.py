@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 from omegaconf import DictConfig
 from running import FAST, Outcome
@@ -120,6 +121,63 @@ def test_joblib_launcher_gives_the_same_results(memcomp_train: Run, joblib_launc
     for row, other in zip(rows("sweep/table.csv"), rows("parallel/table.csv"), strict=True):
         assert row["test_accuracy_mean"] == other["test_accuracy_mean"]
         assert row["energy_gap_mean"] == other["energy_gap_mean"]
+
+
+def launching(monkeypatch: pytest.MonkeyPatch, own: Callable[..., Any]) -> Callable[..., Any]:
+    """Put a launcher in the place of Hydra's own, which is returned; Hydra imports its plugins itself."""
+    name = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+    kind: Any = Plugins.instance().class_name_to_class[name]
+    original: Callable[..., Any] = kind.launch
+    monkeypatch.setattr(kind, "launch", own)
+    return original
+
+
+def test_a_job_that_its_launcher_lost_is_named(memcomp_train: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def one_less(self: Any, jobs: Any, initial_job_idx: int) -> Any:
+        return launch(self, jobs[:-1], initial_job_idx)
+
+    sweep = ["-m", "sampler=cd", "seed=0,1,2", *FAST, "hydra.sweep.dir=sweep"]
+    for own in ([], ["hydra.sweep.subdir=job${hydra.job.num}"]):
+        with monkeypatch.context() as patched:
+            launch = launching(patched, one_less)
+            outcome = memcomp_train(*sweep, *own)
+        assert outcome.status == 1
+        assert [row["n_runs"] for row in rows("sweep/table.csv")] == [str(2 * len(own) + 2)]
+        lost = outcome.out.partition("1 failed")[2].splitlines()[1:3]
+        assert "seed=2" in lost[0]
+        assert "seed=1" not in lost[0]
+        assert lost[1] == "    left nothing in sweep: its launcher lost it"
+    assert memcomp_train(*sweep).status == 0
+
+
+def test_jobs_that_begin_in_other_folders_write_where_the_sweep_was_typed(
+    memcomp_train: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    here = Path.cwd()
+
+    def elsewhere(self: Any, jobs: Any, initial_job_idx: int) -> Any:
+        os.chdir(tmp_path / "elsewhere")
+        begun_at.append(initial_job_idx)
+        try:
+            return launch(self, jobs, initial_job_idx)
+        finally:
+            os.chdir(here)
+
+    launch, begun_at = launching(monkeypatch, elsewhere), list[int]()
+    job = ["-m", "sampler=cd", "seed=0,1", *FAST]
+    for own, folder in (
+        (["hydra.sweep.dir=sweep"], "sweep"),
+        ([], "multirun/*/*"),
+    ):
+        outcome = memcomp_train(*job, *own)
+        assert outcome.status == 0, outcome.err + outcome.out
+        assert len(list(here.glob(f"{folder}/*/result.json"))) == 2
+        assert not list((tmp_path / "elsewhere").iterdir())
+    assert len(begun_at) == 2
+    refused = memcomp_train(*job, "hydra.sweep.dir=${hydra.job.name}")
+    assert refused.status == 2
+    assert "expected a path from the root" in refused.err
 
 
 def test_a_folder_in_use_is_left_to_the_other_process(memcomp_train: Run) -> None:

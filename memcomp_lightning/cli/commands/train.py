@@ -227,7 +227,7 @@ def main() -> None:
                 sys.argv[1:] = line.arguments
                 with answering(line, COMMAND):
                     train()
-                    _end_of_sweep()
+                    _end_of_sweep(line)
         else:
             train()
     except UserError as error:
@@ -238,10 +238,10 @@ def main() -> None:
         raise
 
 
-def _end_of_sweep() -> None:
+def _end_of_sweep(line: CommandLine) -> None:
     """Show the table of a sweep, if this was one, and end with whether a job failed."""
     if (folder := sweep.RememberSweepFolder.folder) is not None:
-        table, n_failed = sweep.merge(folder)
+        table, n_failed = sweep.merge(folder, line.planned)
         say(f"\n{table}\n{closing_lines(short_path(folder))}")
         if n_failed:
             say(f"Go on with: {shlex.join([COMMAND, *sys.argv[1:]])}")

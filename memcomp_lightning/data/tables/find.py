@@ -43,7 +43,8 @@ class Summary:
         n: Rows.
         n_empty: Empty cells.
         n_numbers: Cells that are numbers.
-        odd: The first cell that is no number, and its row from 1; None where there is none.
+        odd: The first cell that is no number, and its row from 1; None where there is none. Of several files the
+            row is told with its file.
         distinct: Different cells, None where they are more than a thousand.
         n_known: Cells of training rows that are not empty.
         mean, squares: Of the numbers in training rows: mean, and sum of squared deviations.
@@ -57,13 +58,13 @@ class Summary:
     n: int = 0
     n_empty: int = 0
     n_numbers: int = 0
-    odd: tuple[int, str] | None = None
+    odd: tuple[int | str, str] | None = None
     distinct: set[Any] | None = field(default_factory=set)
     n_known: int = 0
     mean: float = 0.0
     squares: float = 0.0
     varies: bool = False
-    uneven: tuple[int, str] | None = None
+    uneven: tuple[int | str, str] | None = None
     counts: bool = True
     rises: bool = True
     _first: float = math.nan
@@ -158,6 +159,15 @@ class Found:
     ignored: dict[str, str]
 
 
+def roles_of(given: Mapping[str, str]) -> dict[str, str]:
+    """The columns that ``data.columns`` names as label and weight; so may columns themselves be called."""
+    return {
+        role: given[role]
+        for role in ("label", "weight")
+        if role in given and given[role] not in (*KINDS, "ignore")
+    }
+
+
 def find(summaries: Sequence[Summary], given: Mapping[str, str], file: str, *, uniform: bool = False) -> Found:
     """Decide on the kind of each column.
 
@@ -176,11 +186,7 @@ def find(summaries: Sequence[Summary], given: Mapping[str, str], file: str, *, u
         UserError: A column does not exist, cannot be of its kind, has one value, or mixes numbers and texts.
     """
     by_name = {summary.name: summary for summary in summaries}
-    roles = {
-        role: given[role]
-        for role in ("label", "weight")
-        if role in given and given[role] not in (*KINDS, "ignore")
-    }
+    roles = roles_of(given)
     for name in [*(name for name in given if name not in roles and name != "all"), *roles.values()]:
         if name not in by_name:
             known = ", ".join(list(by_name)[:20]) + (", ..." if len(by_name) > 20 else "")

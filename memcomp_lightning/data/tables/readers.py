@@ -45,6 +45,19 @@ class Opened(NamedTuple):
         return sum(batch.num_rows for batch in self.batches) if self.n is None else self.n
 
 
+TEXTS = (".csv", ".tsv", ".txt", ".data")
+EXCEL = (".xlsx", ".xls", ".ods")
+ARRAYS = (".npy", ".npz", ".h5", ".hdf5")
+ENDINGS = (*TEXTS, ".parquet", *EXCEL, *ARRAYS)
+"""Of the files that are read."""
+
+
+def ending_of(path: Path) -> str:
+    """What tells the kind of a file: its ending, without that of a compressed one."""
+    endings = [ending.lower() for ending in path.suffixes]
+    return endings[-2] if len(endings) > 1 and endings[-1] in (".gz", ".bz2") else "".join(endings[-1:])
+
+
 def opened(path: Path, *, key: str | None = None) -> Opened:
     """Begin to read a file, by its ending.
 
@@ -58,26 +71,13 @@ def opened(path: Path, *, key: str | None = None) -> Opened:
     """
     if not path.is_file():
         raise UserError(f"{path}: there is no such file.")
-    endings = [ending.lower() for ending in path.suffixes]
-    ending = endings[-1] if endings else ""
-    if ending in (".gz", ".bz2") and len(endings) > 1:
-        ending = endings[-2]
-    readers: dict[str, Any] = {
-        ".csv": _texts,
-        ".tsv": _texts,
-        ".txt": _texts,
-        ".data": _texts,
-        ".parquet": _parquet,
-        ".xlsx": _excel,
-        ".xls": _excel,
-        ".ods": _excel,
-    }
+    ending = ending_of(path)
+    if ending in ARRAYS:
+        return _checked(_array(path, ending, key), path)
+    readers = {**dict.fromkeys(TEXTS, _texts), ".parquet": _parquet, **dict.fromkeys(EXCEL, _excel)}
     if ending in readers:
         return _checked(readers[ending](path), path)
-    if ending in (".npy", ".npz", ".h5", ".hdf5"):
-        return _checked(_array(path, ending, key), path)
-    known = ", ".join([*readers, ".npy", ".npz", ".h5", ".hdf5"])
-    raise UserError(f"{path}: files that end in {ending!r} are not read; known are {known}.")
+    raise UserError(f"{path}: files that end in {ending!r} are not read; known are {', '.join(ENDINGS)}.")
 
 
 def of_frame(frame: Any) -> Opened:
@@ -305,11 +305,16 @@ def _chosen(names: list[str], key: str | None, path: Path) -> str:
     return key
 
 
+def rows_at_once(n_columns: int) -> int:
+    """Rows that are held at a time, fewer of many columns."""
+    return max(1, min(ROWS, 2**22 // max(1, n_columns)))
+
+
 def _rows_of(array: Any) -> Iterator[Any]:
     """Record batches of a matrix, whose columns are named by their numbers."""
     n, n_columns = array.shape[0], int(np.prod(array.shape[1:]))
     names = [str(k) for k in range(n_columns)]
-    rows = max(1, min(ROWS, 2**22 // max(1, n_columns)))
+    rows = rows_at_once(n_columns)
     for begin in range(0, n, rows):
         part = array[begin : begin + rows]
         part = part.toarray() if hasattr(part, "toarray") else np.asarray(part)

@@ -1,7 +1,7 @@
 """What the units of a model are in the user's own table: kept with the model, so that results are in its words."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -109,19 +109,22 @@ class TableSchema:
         layers += [Gaussian(kinds.count("real"))] if "real" in kinds else []
         return side_by_side(*layers)
 
-    def encode(self, batch: Any, file: str, first_row: int = 0, *, complete: bool = True) -> Encoded:
+    def encode(
+        self, batch: Any, file: str, rows: Sequence[object] | None = None, *, complete: bool = True
+    ) -> Encoded:
         """Numbers of some rows.
 
         Args:
             batch: A record batch of Arrow, with the columns of the schema by name.
             file: Name of the file, for errors.
-            first_row: Rows before it, for errors.
+            rows: What errors call the rows; None counts them from 1.
             complete: Whether every column of the schema must be there; one that is not is missing otherwise.
 
         Raises:
             UserError: A column is not there, or none of them is; a cell is not what its column can be.
         """
         names, n = set(batch.schema.names), batch.num_rows
+        rows = range(1, n + 1) if rows is None else rows
         if complete and self.weight is not None and self.weight not in names:
             raise UserError(f"{file} has no column {self.weight!r}, the weights of the rows.")
         if not names & set(self.site_names):
@@ -134,10 +137,8 @@ class TableSchema:
                     raise UserError(f"{file} has no column {column.name!r}, which the model has.")
                 v[:, site] = np.nan
                 continue
-            v[:, site] = _read(column, batch, file, first_row)
-        return Encoded(
-            v, self._labels(batch, names, file, first_row), self._weights(batch, names, file, first_row)
-        )
+            v[:, site] = _read(column, batch, file, rows)
+        return Encoded(v, self._labels(batch, names, file, rows), self._weights(batch, names, file, rows))
 
     def decode(self, v: Tensor) -> Columns:
         """Rows in the user's columns and words.
@@ -187,7 +188,7 @@ class TableSchema:
             raise SettingError(f"kind of the label = {label.kind!r} is not allowed: expected 'category'.")
         return cls(columns, label, plain.weight, plain.named, plain.key, plain.width)
 
-    def _labels(self, batch: Any, names: set[str], file: str, first_row: int) -> NDArray[np.int64]:
+    def _labels(self, batch: Any, names: set[str], file: str, rows: Sequence[object]) -> NDArray[np.int64]:
         if self.label is None or self.label.name not in names:
             return np.full(batch.num_rows, UNLABELLED, dtype=np.int64)
         cells = Cells(batch.column(self.label.name))
@@ -201,21 +202,23 @@ class TableSchema:
                 batch,
                 int(unknown.argmax()),
                 file,
-                first_row,
+                rows,
                 f"a class of the training data: {self.label.described}",
             )
         return np.where(np.isnan(found), UNLABELLED, found).astype(np.int64)
 
-    def _weights(self, batch: Any, names: set[str], file: str, first_row: int) -> NDArray[np.float32] | None:
+    def _weights(
+        self, batch: Any, names: set[str], file: str, rows: Sequence[object]
+    ) -> NDArray[np.float32] | None:
         if self.weight is None or self.weight not in names:
             return None
         try:
             found = Cells(batch.column(self.weight)).numbers()
         except CellError as error:
-            _refuse(self.weight, batch, error.row, file, first_row, "a number > 0")
+            _refuse(self.weight, batch, error.row, file, rows, "a number > 0")
         wrong = ~(found > 0)
         if wrong.any():
-            _refuse(self.weight, batch, int(wrong.argmax()), file, first_row, "a number > 0")
+            _refuse(self.weight, batch, int(wrong.argmax()), file, rows, "a number > 0")
         return found.astype(np.float32)
 
 
@@ -232,16 +235,14 @@ class _Plain:
     width: int | None = None
 
 
-def _read(column: Column, batch: Any, file: str, first_row: int) -> NDArray[np.float32]:
+def _read(column: Column, batch: Any, file: str, rows: Sequence[object]) -> NDArray[np.float32]:
     try:
         return column.read(Cells(batch.column(column.name)))
     except CellError as error:
-        _refuse(column.name, batch, error.row, file, first_row, error.expected)
+        _refuse(column.name, batch, error.row, file, rows, error.expected)
         raise AssertionError from error
 
 
-def _refuse(name: str, batch: Any, row: int, file: str, first_row: int, expected: str) -> None:
+def _refuse(name: str, batch: Any, row: int, file: str, rows: Sequence[object], expected: str) -> None:
     cell = batch.column(name)[row].as_py()
-    raise UserError(
-        f"{file}, column {name!r}, row {first_row + row + 1}: {cell!r} is not allowed: expected {expected}."
-    )
+    raise UserError(f"{file}, column {name!r}, row {rows[row]}: {cell!r} is not allowed: expected {expected}.")

@@ -1,10 +1,11 @@
 """Tables from files, frames and arrays, as data of a training."""
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,17 +14,21 @@ from numpy.typing import NDArray
 
 from memcomp_lightning import rng
 from memcomp_lightning.data.images import PixelLayout
-from memcomp_lightning.data.rows import UNLABELLED, Rows
+from memcomp_lightning.data.rows import UNLABELLED, Origin, Rows, Share
 from memcomp_lightning.data.tables.cells import CellError, Cells
 from memcomp_lightning.data.tables.columns import Words
-from memcomp_lightning.data.tables.find import Summary, find
-from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame, opened
-from memcomp_lightning.data.tables.schema import TableSchema
+from memcomp_lightning.data.tables.find import Summary, find, roles_of
+from memcomp_lightning.data.tables.parts import Joined, Part, files_of, parts_of
+from memcomp_lightning.data.tables.readers import Opened, of_array, of_frame
+from memcomp_lightning.data.tables.schema import Encoded, TableSchema
 from memcomp_lightning.errors import UserError, require, require_count
 from memcomp_lightning.models.units import Units
 
 Open = Callable[[], Opened]
 """Begins to read a table anew."""
+
+MOST_NUMBERS = 2**22
+"""Of the evenly spaced rows that each process holds, where each holds a share of the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +43,9 @@ class TableData:
         layout: Where the columns lie in a picture; None where they are none.
         ignored: Why each column that the model does not have is left out.
         minus_one: Rows of the file without a label because theirs is -1.
+        share: Of all rows that this process holds: then ``train`` and ``test`` are its own alone.
+        missing: Share of the cells of all rows that are empty.
+        origin: The files of a table in several.
     """
 
     train: Rows
@@ -48,6 +56,19 @@ class TableData:
     layout: PixelLayout | None = None
     ignored: Mapping[str, str] = field(default_factory=dict)
     minus_one: int = 0
+    share: Share | None = None
+    missing: float = 0.0
+    origin: Origin | None = None
+
+    @property
+    def n_train(self) -> int:
+        """Training rows, in all processes."""
+        return self.train.n if self.share is None else len(self.share.train)
+
+    @property
+    def n_test(self) -> int:
+        """Test rows, in all processes."""
+        return self.test.n if self.share is None or self.share.test is None else len(self.share.test)
 
     @property
     def n_classes(self) -> int:
@@ -86,6 +107,8 @@ class TableData:
     @property
     def unseen(self) -> dict[str, list[str]]:
         """Words of columns and classes that are in no training row, but in test rows or in a run before."""
+        if self.share is not None:  # the others' rows are not here
+            return {}
         found, (v, label, observed, _) = {}, self.train
         numbers = {
             column: v[:, site] if observed is None else v[observed[:, site], site]
@@ -108,7 +131,8 @@ class Table:
     The kinds of the columns are found in the file, see :func:`memcomp_lightning.data.tables.find.find`.
 
     Args:
-        path: CSV or TSV (also .gz), Parquet, Excel, ``.npy``, ``.npz`` (arrays or sparse), HDF5.
+        path: CSV or TSV (also .gz), Parquet, Excel, ``.npy``, ``.npz`` (arrays or sparse), HDF5; or a folder or a
+            pattern of such files with the same columns, which are read as one in the order of their names.
         columns: Kinds by column: ``binary``, ``category``, ``real``, ``spin``, ``probability`` or ``ignore``; the
             name ``all`` stands for all others; ``label`` and ``weight`` name columns.
         validation: A file of rows to look at while training, with the same columns.
@@ -118,6 +142,8 @@ class Table:
         key: Which array of an ``.npz`` or HDF5 file.
         picture: Height and width, where the columns are the pixels of a picture.
         schema: What the columns are, of an earlier training on such rows; None finds it out.
+        share: Number of this process, and of all that hold the rows together: each a block of them, of one length
+            to one row.
     """
 
     path: str | None = None
@@ -129,6 +155,7 @@ class Table:
     key: str | None = None
     picture: tuple[int, int] | None = None
     schema: TableSchema | None = None
+    share: tuple[int, int] = (0, 1)
 
     def __post_init__(self) -> None:
         if self.path is None:
@@ -137,65 +164,80 @@ class Table:
         require(in_range, "data.test_fraction", self.test_fraction, "a number in (0, 1)")
         require_count("data.split_seed", self.split_seed, 0)
 
+    @property
+    def in_parts(self) -> bool:
+        """Whether the rows are in several files, which several processes may share."""
+        return len(files_of(str(self.path))) > 1
+
+    @property
+    def labelled(self) -> bool:
+        """Whether a column of classes is named, whose rows each process holds."""
+        return "label" in roles_of(_named(self.columns))
+
     def load(self) -> TableData:
         """Read the files.
 
         Raises:
             UserError: A file, a column or a cell is not as it must be; the message names it.
         """
-        path = Path(str(self.path))
+        path = str(self.path)
+        parts = parts_of(path, key=self.key)
         files = {"validation": self.validation, "test": self.test}
-        further: dict[str, tuple[str, Open]] = {
-            name: (file, partial(opened, Path(file), key=self.key)) for name, file in files.items() if file
-        }
         return table_data(
-            partial(opened, path, key=self.key),
-            name=path.name,
+            parts,
+            name=Path(path).name if len(parts) == 1 else path,
             columns=self.columns,
-            further=further,
+            further={name: parts_of(file, key=self.key) for name, file in files.items() if file},
             test_fraction=self.test_fraction,
             split_seed=self.split_seed,
             picture=self.picture,
             schema=self.schema,
             key=self.key,
+            share=self.share,
         )
 
 
 def table_data(
-    begin: Open,
+    parts: Sequence[Part],
     *,
     name: str,
     columns: Mapping[str, str] | str | None = None,
-    further: Mapping[str, tuple[str, Open]] | None = None,
+    further: Mapping[str, Sequence[Part]] | None = None,
     test_fraction: float = 0.1,
     split_seed: int = 0,
     picture: tuple[int, int] | None = None,
     schema: TableSchema | None = None,
     key: str | None = None,
+    share: tuple[int, int] = (0, 1),
 ) -> TableData:
     """Find the columns of a table in one pass over its rows, and make numbers of them in another one.
+
+    Of several processes each looks at all rows in the first pass, and reads its own share alone in the second.
 
     Kinds and words are those of all rows, so that a rare word among the test rows is no error. Means and scales
     are those of the training rows: to know which these are, rows that are split are counted first.
 
     Args:
-        begin: Begins to read the training rows.
+        parts: Of the training rows.
         name: Of the data, for reports and errors.
         columns: As of :class:`Table`.
-        further: Names and readings of the ``validation`` and ``test`` rows, where they are apart.
+        further: The ``validation`` and ``test`` rows, where they are apart; each process holds all of them.
         test_fraction: Share of the rows that is split off.
         split_seed: Seed of that split.
         picture: Height and width, where the columns are pixels.
         schema: What the columns are; None finds it out.
         key: Of the array in files of several, for the schema.
+        share: Number of this process, and of all that share the rows.
     """
     further, given = further or {}, _named(columns)
-    order, n_test = None, 0
-    if "test" not in further:
-        order, n_test = _order(begin().counted(), name, test_fraction, split_seed)
+    order, n_test, several = None, 0, share[1] > 1
+    if "test" not in further or several:
+        n = sum(part.begin().counted() for part in parts)
+        order, n_test = _order(n, name, test_fraction, split_seed) if "test" not in further else (np.arange(n), 0)
     ignore = {column for column, kind in given.items() if kind == "ignore"}
     trained = None if order is None else order < len(order) - n_test
-    summaries, n, named = _summaries(begin(), name, ignore, trained)
+    joined, some = Joined(parts), _Some(name, order) if several else None
+    summaries, n, named = _summaries(joined, name, ignore, trained, some)
     if schema is None:
         found = find(summaries, given, name, uniform=not named)
         schema, ignored = (
@@ -206,12 +248,103 @@ def table_data(
         )
     else:
         ignored = _besides(schema, [summary.name for summary in summaries])
-    apart = {part: _whole(reading(), file, schema) for part, (file, reading) in further.items()}
+    apart = {which: _whole(some, schema) for which, some in further.items()}
     layout = None if picture is None else _layout(picture, schema)
-    parts = _split(begin(), name, schema, [n - n_test, n_test], order)
-    train, test = parts[0], apart.get("test", parts[1])
-    minus_one = _minus_one(summaries, parts, schema)
-    return TableData(train, test, apart.get("validation"), schema, name, layout, ignored, minus_one)
+    missing = _missing(summaries, schema)
+    sizes, blocks = [n - n_test, n_test], _blocks(n, share[1])
+    masked = True if several and missing > 0 else None  # by all processes alike
+    train, rest = _split(joined, name, schema, sizes, order, blocks[share[0]], masked)
+    files = [Path(part.name) for part in parts]
+    origin = Origin(files, f"{sizes} {split_seed}", n_test > 0) if len(parts) > 1 else None
+    test, validation = apart.get("test", rest), apart.get("validation")
+    made = TableData(train, test, validation, schema, name, layout, ignored, missing=missing, origin=origin)
+    if some is None or order is None:
+        minus_one = _minus_one(summaries, [train, rest], schema)
+        return replace(made, minus_one=minus_one)
+    holder = _holders(order, blocks)
+    first, last = some.rows(schema, joined, sizes[0], masked)
+    return replace(
+        made,
+        share=Share(
+            *share,
+            holder[: sizes[0]],
+            holder[sizes[0] :] if n_test else None,
+            first.rows,
+            last.rows if n_test else None,
+            first.places,
+        ),
+    )
+
+
+def _missing(summaries: list[Summary], schema: TableSchema) -> float:
+    """Share of the cells of the columns that the model has that are empty."""
+    own = [summary for summary in summaries if summary.name in schema.site_names]
+    return sum(summary.n_empty for summary in own) / max(1, sum(summary.n for summary in own))
+
+
+def _blocks(n: int, n_processes: int) -> list[range]:
+    """Rows of each process, as they follow each other in the files."""
+    bounds = [k * n // n_processes for k in range(n_processes + 1)]
+    return [range(*pair) for pair in pairwise(bounds)]
+
+
+def _holders(order: NDArray[np.int64], blocks: Sequence[range]) -> torch.Tensor:
+    """The process that holds each row, in the order of their places."""
+    holder = np.empty(len(order), dtype=np.int16)
+    for rank, block in enumerate(blocks):
+        holder[order[block.start : block.stop]] = rank
+    return torch.from_numpy(holder)
+
+
+class _Placed(NamedTuple):
+    """Rows, and their places among all training or all test rows."""
+
+    rows: Rows
+    places: torch.Tensor
+
+
+class _Some:
+    """Evenly spaced rows of all, which are kept as they were read until it is known what the columns are."""
+
+    def __init__(self, name: str, order: NDArray[np.int64] | None) -> None:
+        assert order is not None
+        self._name, self._order, self._step, self._n = name, order, 0, 0
+        self._kept: list[Any] = []
+        self._numbers: list[int] = []
+
+    def add(self, batch: Any) -> None:
+        """Keep some of the next rows."""
+        self._step = self._step or -(-len(self._order) * batch.num_columns // MOST_NUMBERS)
+        places = self._order[self._n : self._n + batch.num_rows]
+        chosen = np.flatnonzero(places % self._step == 0)
+        self._kept.append(batch.take(pa.array(chosen)))
+        self._numbers += (self._n + chosen).tolist()
+        self._n += batch.num_rows
+
+    def rows(self, schema: TableSchema, joined: Joined, n_train: int, masked: bool | None) -> list[_Placed]:
+        """Those among the training rows and those among the test rows, each in the order of their places."""
+        step = -(-len(self._order) * schema.units().n // MOST_NUMBERS)
+        places = self._order[self._numbers]
+        fewer = np.flatnonzero(places % (-(-step // self._step) * self._step) == 0)
+        in_turn = fewer[np.argsort(places[fewer])]
+        encoded, first = list[Encoded](), 0
+        for batch in self._kept:
+            names = [joined.place(number + 1) for number in self._numbers[first : first + batch.num_rows]]
+            first += batch.num_rows
+            encoded.append(schema.encode(batch, self._name, names))
+        self._kept = []
+        v, label = (
+            np.concatenate(parts)[in_turn] for parts in ([e.v for e in encoded], [e.label for e in encoded])
+        )
+        weights = [part.weight for part in encoded if part.weight is not None]
+        weight = np.concatenate(weights)[in_turn] if weights else None
+        n = int((places[in_turn] < n_train).sum())
+        found = []
+        for part, begin in ((slice(None, n), 0), (slice(n, None), n_train)):
+            own = None if weight is None else torch.from_numpy(weight[part].copy())
+            rows = _rows(torch.from_numpy(v[part].copy()), torch.from_numpy(label[part].copy()), own, masked)
+            found.append(_Placed(rows, torch.from_numpy(places[in_turn[part]] - begin)))
+        return found
 
 
 def _minus_one(summaries: list[Summary], parts: list[Rows], schema: TableSchema) -> int:
@@ -250,7 +383,7 @@ def data_of(table: Any, label: Any = None, *, name: str = "table", **settings: A
     if label is not None:
         settings["columns"] = {**_named(settings.get("columns")), "label": LABEL}
         begin = partial(_beside, begin, np.asarray(label))
-    return table_data(begin, name=name, **settings)
+    return table_data([Part(name, begin)], name=name, **settings)
 
 
 LABEL = "label"
@@ -259,7 +392,7 @@ LABEL = "label"
 
 def read_rows(path: Path, schema: TableSchema, *, complete: bool = True) -> Rows:
     """Rows of a file as numbers of the units of a schema; columns may be missing unless ``complete``."""
-    return _whole(opened(path, key=schema.key), str(path), schema, complete=complete)
+    return _whole(parts_of(str(path), key=schema.key), schema, complete=complete)
 
 
 def _besides(schema: TableSchema, names: list[str]) -> dict[str, str]:
@@ -302,12 +435,14 @@ def _layout(picture: tuple[int, int], schema: TableSchema) -> PixelLayout:
 
 
 def _summaries(
-    found: Opened, name: str, skipped: Collection[str], trained: NDArray[np.bool_] | None
+    joined: Joined, name: str, skipped: Collection[str], trained: NDArray[np.bool_] | None, kept: _Some | None
 ) -> tuple[list[Summary], int, bool]:
     """What is known of each column, how many rows there are, and whether the columns have names of their own."""
     summaries: list[Summary] = []
-    for batch in found.batches:
+    for batch in joined.batches():
         first = summaries[0].n if summaries else 0
+        if kept is not None:
+            kept.add(batch)
         some = None if trained is None else trained[first : first + batch.num_rows]
         if not summaries:
             summaries = [Summary(str(column)) for column in batch.schema.names]
@@ -318,31 +453,39 @@ def _summaries(
             try:
                 summary.add(Cells(column), some)
             except CellError as error:
-                row, cell = summary.n + error.row + 1, column[error.row].as_py()
+                row, cell = joined.place(summary.n + error.row + 1), column[error.row].as_py()
                 raise UserError(
                     f"{name}, column {summary.name!r}, row {row}: {cell!r} is not allowed: expected "
                     f"{error.expected}. Type 'data.columns={{{summary.name}: ignore}}' to leave the column out."
                 ) from error
     n = summaries[0].n if summaries else 0
     _require_rows(n, name)
-    return summaries, n, found.named
+    for summary in summaries if len(joined.parts) > 1 else ():
+        for which in ("odd", "uneven"):
+            if (cell := getattr(summary, which)) is not None:
+                setattr(summary, which, (joined.place(cell[0]), cell[1]))
+    return summaries, n, joined.named
 
 
-def _whole(found: Opened, file: str, schema: TableSchema, *, complete: bool = True) -> Rows:
-    """All rows of a file that is small enough to be joined."""
-    v, label, weight, first = list[NDArray[Any]](), list[NDArray[Any]](), list[NDArray[Any]](), 0
-    for batch in found.batches:
-        if not found.named:
-            _check_width(batch.schema.names, schema, file)
-        part = schema.encode(batch, file, first, complete=complete)
-        _check_rows(part.v, file, first, required=complete)
-        v.append(part.v)
-        label.append(part.label)
-        if part.weight is not None:
-            weight.append(part.weight)
-        first += batch.num_rows
-    if not first:
-        raise UserError(f"{file} has no rows.")
+def _whole(parts: Sequence[Part], schema: TableSchema, *, complete: bool = True) -> Rows:
+    """All rows of files that are small enough to be joined."""
+    v, label, weight, n = list[NDArray[Any]](), list[NDArray[Any]](), list[NDArray[Any]](), 0
+    for file, begin in parts:
+        found, first = begin(), 0
+        for batch in found.batches:
+            if not found.named:
+                _check_width(batch.schema.names, schema, file)
+            rows = range(first + 1, first + batch.num_rows + 1)
+            part = schema.encode(batch, file, rows, complete=complete)
+            _check_rows(part.v, file, rows, required=complete)
+            v.append(part.v)
+            label.append(part.label)
+            if part.weight is not None:
+                weight.append(part.weight)
+            first += batch.num_rows
+        n += first
+    if not n:
+        raise UserError(f"{parts[0].name} has no rows.")
     joined = [torch.from_numpy(_joined(parts)) for parts in (v, label, weight) if parts]
     return _rows(joined[0], joined[1], joined[2] if len(joined) > 2 else None)
 
@@ -364,63 +507,90 @@ def _check_width(names: list[str], schema: TableSchema, file: str) -> None:
         raise UserError(f"{file} has {len(names)} columns: expected {schema.width}, as the array of the training.")
 
 
-def _split(found: Opened, file: str, schema: TableSchema, sizes: list[int], order: Any) -> list[Rows]:
-    """Rows of a file in parts of these sizes, each written where it belongs: no table is held twice.
+def _split(
+    joined: Joined,
+    name: str,
+    schema: TableSchema,
+    sizes: list[int],
+    order: NDArray[np.int64] | None,
+    block: range,
+    masked: bool | None,
+) -> list[Rows]:
+    """A block of the rows of a table, dealt into sets, each row written where it belongs: none is held twice.
 
     Args:
-        found: The reading.
-        file: Its name, for errors.
+        joined: The table, which has been read once.
+        name: Of the table, for errors.
         schema: Of the columns.
-        sizes: Of the parts.
-        order: Place of each row over all parts, one after the other; None keeps the order of the file.
+        sizes: Of the sets, over all rows.
+        order: Place of each row over all sets, one after the other; None keeps the order of the table.
+        block: The rows that are taken.
+        masked: As of :func:`_rows`.
     """
-    v = [torch.empty(size, schema.n_sites, dtype=torch.float32, device="cpu") for size in sizes]
-    label = [torch.empty(size, dtype=torch.long, device="cpu") for size in sizes]
-    weight = [torch.empty(size, dtype=torch.float32, device="cpu") for size in sizes]
-    begins = np.cumsum([0, *sizes])
-    first = 0
-    for batch in found.batches:
-        part = schema.encode(batch, file, first)
-        _check_rows(part.v, file, first)
-        places = (
-            np.arange(first, first + batch.num_rows) if order is None else order[first : first + batch.num_rows]
-        )
-        for k in range(len(sizes)):
-            here = (places >= begins[k]) & (places < begins[k + 1])
-            at = torch.from_numpy(places[here] - begins[k])
+    own = np.arange(block.start, block.stop) if order is None else order[block.start : block.stop]
+    bounds = list(pairwise(np.cumsum([0, *sizes])))
+    places = [np.sort(own[(own >= begin) & (own < end)]) for begin, end in bounds]
+    v = [torch.empty(len(some), schema.n_sites, dtype=torch.float32, device="cpu") for some in places]
+    label = [torch.empty(len(some), dtype=torch.long, device="cpu") for some in places]
+    weight = [torch.empty(len(some), dtype=torch.float32, device="cpu") for some in places]
+    for first, part in _encoded(joined, name, schema, block):
+        begin = first - block.start
+        to = own[begin : begin + len(part.v)]
+        for k, (lowest, end) in enumerate(bounds):
+            here = (to >= lowest) & (to < end)
+            at = torch.from_numpy(np.searchsorted(places[k], to[here]))
             v[k][at] = torch.from_numpy(part.v[here])
             label[k][at] = torch.from_numpy(part.label[here])
             if part.weight is not None:
                 weight[k][at] = torch.from_numpy(part.weight[here])
-        first += batch.num_rows
     weighted = schema.weight is not None
-    return [_rows(v[k], label[k], weight[k] if weighted else None) for k in range(len(sizes))]
+    return [_rows(v[k], label[k], weight[k] if weighted else None, masked) for k in range(len(sizes))]
 
 
-def _rows(v: torch.Tensor, label: torch.Tensor, weight: torch.Tensor | None) -> Rows:
-    """Rows with the mask of what is missing, which becomes 0 in place."""
-    if not bool(v.sum().isnan()):
+def _encoded(joined: Joined, name: str, schema: TableSchema, block: range) -> Iterator[tuple[int, Encoded]]:
+    """A block of the rows as numbers, each batch with the number of its first row; other files are not read."""
+    for part, (begin, end) in zip(joined.parts, pairwise([0, *joined.ends]), strict=True):
+        if end <= block.start or begin >= block.stop:
+            continue
+        file, first = name if len(joined.parts) == 1 else part.name, begin
+        for batch in part.begin().batches:
+            lowest = max(first, block.start)
+            n = min(first + batch.num_rows, block.stop) - lowest
+            if n > 0:
+                rows = range(lowest - begin + 1, lowest - begin + n + 1)
+                encoded = schema.encode(batch.slice(lowest - first, n), file, rows)
+                _check_rows(encoded.v, file, rows)
+                yield lowest, encoded
+            first += batch.num_rows
+        if first != end:
+            raise UserError(f"{file} has changed while it was read: it had {end - begin:,} rows.")
+
+
+def _rows(v: torch.Tensor, label: torch.Tensor, weight: torch.Tensor | None, masked: bool | None = None) -> Rows:
+    """Rows with the mask of what is missing, which becomes 0 in place; None finds out whether they need one."""
+    if masked is None and not bool(v.sum().isnan()):
         return Rows(v, label, None, weight)
     observed = ~v.isnan()
     return Rows(v.nan_to_num_(nan=0.0), label, observed, weight)
 
 
-def _check_rows(v: Any, file: str, first_row: int, *, required: bool = True) -> None:
+def _check_rows(v: Any, file: str, rows: range, *, required: bool = True) -> None:
     empty = np.isnan(v).all(axis=1)
     if required and empty.any():
-        row = first_row + int(empty.argmax()) + 1
+        row = rows[int(empty.argmax())]
         raise UserError(f"{file}, row {row}: every value that the model has is missing. Leave out the row.")
 
 
 def _table(lines: list[tuple[str, str, str]], data: TableData) -> str:
     """Aligned columns, under a line on the rows."""
-    n, n_test = data.train.n, data.test.n
-    counts = f"{n:,} rows to train on, {n_test:,} test rows"
+    counts = f"{data.n_train:,} rows to train on, {data.n_test:,} test rows"
     if data.validation is not None:
         counts += f", {data.validation.n:,} to look at"
     if data.train.observed is not None:
-        share = 1 - float(data.train.observed.float().mean())
-        counts += f", {share:.1%} of the cells missing"
+        missing = 1 - float(data.train.observed.float().mean()) if data.share is None else data.missing
+        counts += f", {missing:.1%} of the cells missing"
+    if data.share is not None:
+        counts += f", shared by {data.share.n_processes} processes"
     if len(lines) > MOST_LINES or not data.schema.named:
         kinds = [kind for _, kind, _ in lines]
         by_kind = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
