@@ -11,6 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import moved
 from memcomp_lightning.data.missing import split_missing
 from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.models.units import Units
@@ -248,10 +249,15 @@ class Batches:
                 observed = None if observed is None else self._units.over_sites(observed)
         if self._weight is None:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
-        weights = self._weight if order is None else self._weight[order]
-        weight, of_step = weights[..., positions], weights[..., chunk.step]
-        share = self._world_size * float(weight.sum()) / float(of_step.sum())  # alike for all seeds
+        weight, share = self._weights(positions, order), 1.0
+        if positions != chunk.step:  # a device would be waited for; the share is alike for all seeds
+            of_step = self._weights(chunk.step, order)
+            share = self._world_size * float(weight.sum()) / float(of_step.sum())
         return Batch(v, label, share, chunk.closes_step, weight, observed)
+
+    def _weights(self, positions: slice, order: Tensor | None) -> Tensor:
+        assert self._weight is not None
+        return self._weight[..., positions] if order is None else self._weight[order[..., positions]]
 
     def _labels(self, positions: slice, index: Tensor | None) -> Tensor:
         if index is None:
@@ -270,7 +276,8 @@ class Batches:
                 [torch.randperm(n, generator=generator, device="cpu") + first for first in first_rows]
             )
         order = torch.cat([orders[seed] for seed in self._seeds])
-        return order.view(*self._replicas, n).to(self._label.device)
+        found: Tensor = moved(order.view(*self._replicas, n), self._label.device)
+        return found
 
 
 class _Chunk(NamedTuple):
@@ -327,5 +334,5 @@ def _plan(n: int, batch_size: int | None, chunk_size: int, rank: int, world_size
             part = shard[bounds[k] : bounds[k + 1]]
             positions = slice(part.start, part.stop, part.step)
             share = world_size * len(part) / len(step)
-            plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1))
+            plan.append(_Chunk(positions, slice(step.start, step.stop, 1), share, k == n_chunks - 1))
     return plan

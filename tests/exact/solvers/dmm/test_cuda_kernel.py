@@ -14,7 +14,7 @@ from memcomp_lightning.solvers.dmm import DmmSolver
 
 def test_same_trajectories_and_states_in_the_simulator():
     environment = os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}
-    program = [sys.executable, str(Path(__file__).with_name("simulated.py"))]
+    program = [sys.executable, str(Path(__file__).with_name("cuda_checks.py"))]
     done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
     assert done.stdout == "alike\n", done.stderr
 
