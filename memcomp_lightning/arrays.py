@@ -48,6 +48,13 @@ def alike(x: AnyArray, like: AnyArray) -> Array:
     return namespace(like).asarray(x, device=like.device)
 
 
+def moved(x: Any, device: Any) -> Any:
+    """A tensor of torch on a device. A copy from the host joins the device's queue, and nothing waits for it."""
+    # A copy to the host would be read too early if it was not waited for. MPS is left as it was.
+    queued = x.device.type == "cpu" and device.type not in ("cpu", "mps")
+    return x.to(device, non_blocking=queued)
+
+
 def to_numpy(x: AnyArray) -> NDArray[Any]:
     """``x`` as a numpy array, which shares its memory where it can."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
@@ -71,6 +78,11 @@ def double(x: Array) -> Array:
 def multiply_add(x: Array, a: Array, b: Array) -> Array:
     """``x + a b``, rounded once where the library can do so."""
     return x + a * b if isinstance(x, np.ndarray) else x.addcmul(a, b)
+
+
+def sign(x: Array) -> Array:
+    """-1, 0 or 1. NaN is not looked for, as the array API's does: an accelerator would be waited for."""
+    return np.sign(x) if isinstance(x, np.ndarray | np.generic) else x.sign()
 
 
 def sigmoid(x: Array) -> Array:

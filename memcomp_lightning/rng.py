@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from memcomp_lightning.arrays import AnyArray, Array, alike, as_array, cast, is_floating, namespace
+from memcomp_lightning.arrays import AnyArray, Array, alike, as_array, cast, is_floating, moved, namespace
 
 if TYPE_CHECKING:
     import torch
@@ -100,7 +100,7 @@ def uniform(shape: Iterable[int], *, generator: "Generator", like: Array | None 
     draw = torch.empty(tuple(shape), device=generator.device, dtype=dtype)
     compiled = _compiled_for(draw)
     draw = draw.uniform_(generator=generator) if compiled is None else compiled(draw, generator)
-    return draw if like is None else draw.to(like.device)
+    return draw if like is None else moved(draw, like.device)
 
 
 def _compiled_for(draw: "Tensor") -> "Callable[[Tensor, torch.Generator], Tensor] | None":
@@ -134,4 +134,5 @@ def integers(n: int, shape: Iterable[int], *, generator: "Generator", like: AnyA
         return alike(generator.integers(n, size=tuple(shape)), like)
     import torch
 
-    return alike(torch.randint(n, tuple(shape), generator=generator, device=generator.device), like)
+    draw = torch.randint(n, tuple(shape), generator=generator, device=generator.device)
+    return alike(draw if isinstance(like, np.ndarray | np.generic) else moved(draw, like.device), like)

@@ -11,6 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from memcomp_lightning import rng
+from memcomp_lightning.arrays import moved
 from memcomp_lightning.data.missing import split_missing
 from memcomp_lightning.errors import SettingError, require, require_count
 from memcomp_lightning.models.units import Units
@@ -259,18 +260,23 @@ class Batches:
                 observed = None if observed is None else self._units.over_sites(observed)
         if self._weight is None:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
-        weights = self._weight if order is None else self._weight[order]
-        weight = weights[..., positions]
-        of_step = self._of_steps[chunk.number] if self._of_steps else float(weights[..., chunk.step].sum())
-        share = self._world_size * float(weight.sum()) / of_step  # alike for all seeds
+        weight, share = self._weights(positions, order), 1.0
+        if positions != chunk.step or self._of_steps:  # a device would be waited for; alike for all seeds
+            alone = not self._of_steps
+            of_step = float(self._weights(chunk.step, order).sum()) if alone else self._of_steps[chunk.number]
+            share = self._world_size * float(weight.sum()) / of_step
         return Batch(v, label, share, chunk.closes_step, weight, observed)
+
+    def _weights(self, positions: slice, order: Tensor | None) -> Tensor:
+        assert self._weight is not None
+        return self._weight[..., positions] if order is None else self._weight[order[..., positions]]
 
     def _weights_of_steps(self, order: Tensor | None) -> list[float]:
         """Sum of the weights of each step over all processes, where each knows its own alone."""
         if self._weight is None or self._held is None:
             return []
-        weights = self._weight if order is None else self._weight[order]
-        own = [float(weights[chunk.step].double().sum()) for chunk in self._chunks if chunk.closes_step]
+        closing = [chunk for chunk in self._chunks if chunk.closes_step]
+        own = [float(self._weights(chunk.step, order).double().sum()) for chunk in closing]
         of_all: list[list[float]] = [own] * self._world_size
         torch.distributed.all_gather_object(of_all, own)
         return [sum(of_step) for of_step in zip(*of_all, strict=True)]
@@ -294,7 +300,8 @@ class Batches:
                 [torch.randperm(n, generator=generator, device="cpu") + first for first in first_rows]
             )
         order = torch.cat([orders[seed] for seed in self._seeds])
-        return order.view(*self._replicas, n).to(self._label.device)
+        found: Tensor = moved(order.view(*self._replicas, n), self._label.device)
+        return found
 
 
 class _Chunk(NamedTuple):
@@ -353,7 +360,7 @@ def _plan(
             part = shard[bounds[k] : bounds[k + 1]]
             positions = slice(part.start, part.stop, part.step)
             share = world_size * len(part) / n_images
-            plan.append(_Chunk(positions, slice(step.start, step.stop), share, k == n_chunks - 1, number))
+            plan.append(_Chunk(positions, slice(step.start, step.stop, 1), share, k == n_chunks - 1, number))
     return plan
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from memcomp_lightning.arrays import moved
 from memcomp_lightning.models.units import Units
 
 
@@ -39,7 +40,7 @@ class DiscreteSites(NamedTuple):
         sites = [*form.groups, *([bit] for bit in form.lone())]
         n_groups, widest = len(form.groups), max(map(len, sites), default=1)
         n_states = max(widest, 2) if len(sites) > n_groups else widest
-        at, of_low, of_width = form.at.cpu(), form.low.to(like).cpu(), form.width.to(like).cpu()
+        at, of_low, of_width = form.at.cpu(), form.low.to(like.dtype).cpu(), form.width.to(like.dtype).cpu()
         entries = torch.zeros(len(sites), widest, dtype=torch.long, device="cpu")
         low, width = torch.zeros(2, len(sites), widest, dtype=like.dtype, device="cpu")
         high = torch.zeros(len(sites), n_states, widest, dtype=like.dtype, device="cpu")
@@ -56,7 +57,7 @@ class DiscreteSites(NamedTuple):
                 high[number, 1, 0] = 1.0
                 exists[number, :2] = True
         parts = units.site_of().cpu()[entries[:, 0]], entries, low, width, high, exists
-        return cls(*(part.to(like.device) for part in parts))
+        return cls(*(moved(part, like.device) for part in parts))
 
     @property
     def values(self) -> Tensor:

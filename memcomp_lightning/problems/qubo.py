@@ -36,9 +36,11 @@ class Qubo:
         problems = coupling[:axes]
         require(linear == (*problems, self.n), "linear shape", linear, f"{(*problems, self.n)}")
         require(offset == problems, "offset shape", offset, f"{problems}")
-        isfinite = namespace(self.linear).isfinite
-        for name, numbers in (("coupling", self.coupling), ("linear", self.linear), ("offset", self.offset)):
-            require(bool(isfinite(numbers).all()), name, "an array with NaN or infinite entries", "finite numbers")
+        names, isfinite = ("coupling", "linear", "offset"), namespace(self.linear).isfinite
+        finite = [isfinite(getattr(self, name)).all() for name in names]
+        if not bool(finite[0] & finite[1] & finite[2]):  # at once: a device would be waited for three times
+            name = next(name for name, one in zip(names, finite, strict=True) if not bool(one))
+            require(False, name, "an array with NaN or infinite entries", "finite numbers")
 
     @property
     def n(self) -> int:

@@ -200,10 +200,10 @@ def seeds(n: int, generator: "Generator") -> NDArray[np.uint64]:
     return to_numpy(rng.integers(2**62, (n,), generator=generator, like=np.zeros(0))).astype(np.uint64)
 
 
-def check_kernel(kernel: str, obstacle_here: str | None = None) -> None:
+def check_kernel(kernel: str, obstacle_here: str | None = None, others: Sequence[str] = ()) -> None:
     """Refuse an unknown kernel, and a compiled one where something speaks against it."""
-    require_choice("kernel", kernel, ("auto", "compiled", "reference"))
-    if kernel == "compiled":
+    require_choice("kernel", kernel, ("auto", "compiled", "reference", *others))
+    if kernel not in ("auto", "reference"):
         reason = obstacle_here or obstacle("cpu")
         require(reason is None, "kernel", kernel, "'auto' or 'reference' here", reason or "")
 

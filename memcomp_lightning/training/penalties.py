@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from memcomp_lightning.arrays import moved
 from memcomp_lightning.errors import require
 from memcomp_lightning.models.base import EnergyModel
 from memcomp_lightning.models.units import Units
@@ -81,10 +82,10 @@ class GroupSparsity:
 
     def __call__(self, model: EnergyModel) -> Float[Tensor, "*replicas"]:
         """The sum of the norms, times the strength."""
-        coupling, group = _couplings(model), _groups(model)
-        if len(group) == 0:
+        coupling, (group, n_groups) = _couplings(model), _groups(model)
+        if n_groups == 0:
             return coupling.sum(-1)
-        squares = coupling.new_zeros(*coupling.shape[:-1], int(group.max()) + 1)
+        squares = coupling.new_zeros(*coupling.shape[:-1], n_groups)
         squares = squares.index_add(-1, group, coupling.square())
         is_zero = squares == 0
         norms = squares.masked_fill(is_zero, 1.0).sqrt().masked_fill(is_zero, 0.0)  # the root has no slope at 0
@@ -103,23 +104,24 @@ def _couplings(model: EnergyModel) -> Tensor:
     return model.quadratic_form().coupling.flatten(len(model.replicas))
 
 
-def _groups(model: EnergyModel) -> Tensor:
-    """For each coupling the number of its pair of sites, ``(n,)``."""
+def _groups(model: EnergyModel) -> tuple[Tensor, int]:
+    """For each coupling the number of its pair of sites, ``(n,)``; and how many pairs there are."""
     form, visible = model.quadratic_form(), model.visible
     if form.pairs is None:
         first, second = _site_of(model.hidden, model), _site_of(visible, model)
-        return (first.unsqueeze(-1) * visible.n_sites + second).flatten()
+        return (first.unsqueeze(-1) * visible.n_sites + second).flatten(), model.hidden.n_sites * visible.n_sites
     site_of = torch.cat((_site_of(visible, model), _site_of(model.hidden, model) + visible.n_sites))
     first, second = site_of[form.pairs].unbind(-1)
     n_sites = visible.n_sites + model.hidden.n_sites
     if n_sites == model.n_units:  # an entry a site: each coupling is its own group, and nothing is sorted
-        return torch.arange(len(first), device=first.device)
-    number: Tensor = (first * n_sites + second).unique(return_inverse=True)[1]
-    return number
+        return torch.arange(len(first), device=first.device), len(first)
+    pairs, number = (first * n_sites + second).unique(return_inverse=True)
+    return number, len(pairs)
 
 
 def _site_of(units: Units, model: EnergyModel) -> Tensor:
-    return units.site_of().to(model.b.device)
+    site_of: Tensor = moved(units.site_of(), model.b.device)
+    return site_of
 
 
 def _require_strength(penalty: L1 | L2 | GroupSparsity) -> None:

@@ -5,8 +5,10 @@ each operation for which the host waits (a value that is read, a shape that depe
 memories) is noted by its name. What an accelerator's kernels compute, and how fast, does not show.
 """
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -15,8 +17,11 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 # PyTorch's device without memory: it lets tensors of any type claim to be there, autograd included.
 NAME = "meta"
-VALUES_DECIDE = ("_local_scalar_dense", "equal", "nonzero", "masked_select", "_unique2", "unique_dim")
-# The names of the operations for which the host has waited.
+VALUES_DECIDE = (
+    *("_local_scalar_dense", "equal", "nonzero", "masked_select", "_unique2", "unique_dim", "unique_consecutive"),
+    *("repeat_interleave", "bincount", "histc", "multinomial"),
+)
+# The operations for which the host has waited, each with the line of the package that called it.
 waits: list[str] = []
 
 
@@ -86,9 +91,10 @@ def _run(function, args, kwargs):
         if hosts:
             raise RuntimeError(f"{function}: tensors of two devices; on the host {hosts}")
     by_mask = name.startswith("index") and any(part.dtype == torch.bool for part in of_device[1:])
-    crosses = is_copy and any(isinstance(part, OnDevice) != to_device for part in tensors)
+    queued = to_device and (kwargs.get("non_blocking", False) or (name == "copy_" and args[2:] == (True,)))
+    crosses = is_copy and not queued and any(isinstance(part, OnDevice) != to_device for part in tensors)
     if (of_device and name in VALUES_DECIDE) or by_mask or crosses:
-        waits.append(name)
+        waits.append(f"{name} at {_line()}")
     known = {id(part.values): part for part in of_device}
     on_host = tree_map(lambda part: part.values if isinstance(part, OnDevice) else part, (args, kwargs))
     result = function(*on_host[0], **on_host[1] | ({"device": torch.device("cpu")} if asked is not None else {}))
@@ -97,3 +103,22 @@ def _run(function, args, kwargs):
     return tree_map(
         lambda x: known[id(x)] if id(x) in known else OnDevice(x) if isinstance(x, Tensor) else x, result
     )
+
+
+def shortened(file: str) -> str:
+    """The path of a file within the package."""
+    return file.rpartition("/memcomp_lightning/")[2]
+
+
+def _line() -> str:
+    """The innermost line of the package, or that of the caller of torch where none is."""
+    frame = sys._getframe(1)
+    first = None
+    while frame is not None:
+        file = frame.f_code.co_filename
+        if "/memcomp_lightning/" in file:
+            return f"{shortened(file)}:{frame.f_lineno}"
+        if first is None and "/torch/" not in file and file != __file__:
+            first = f"{Path(file).name}:{frame.f_lineno}"
+        frame = frame.f_back
+    return str(first)

@@ -6,7 +6,7 @@ Source: [P] Pei, Di Ventra, arXiv:2102.04557, eqs. for v, X and Y. Constants: do
 from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple
 
-from memcomp_lightning.arrays import Array, namespace
+from memcomp_lightning.arrays import Array, namespace, sign
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import Graph
 from memcomp_lightning.problems.maxsat import WeightedMaxSat, as_qubo, over_states
@@ -150,7 +150,6 @@ class BondField:
         """Right-hand side; each line names its equation."""
         voltage = state.voltage
         first, second = machine.graph.gather(voltage)
-        sign = namespace(voltage).sign
         # [P]: dv_i = alpha sum_j J_ij v_j - 2 beta (sum_j X_ij) v_i.
         drive = machine.graph.scatter(machine.bond * second, machine.bond * first) + machine.field
         strength = abs(machine.bond) * state.short_term

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from memcomp_lightning.arrays import Array, add_up, cast, multiply_add, namespace
+from memcomp_lightning.arrays import Array, add_up, cast, multiply_add, namespace, sign
 from memcomp_lightning.errors import require
 from memcomp_lightning.problems.graph import Graph
 from memcomp_lightning.problems.maxsat import Clauses, WeightedMaxSat, from_qubo, over_states
@@ -149,7 +149,7 @@ class ClauseField:
             first=over_states(maxsat.first, n_axes),
             second=over_states(maxsat.second, n_axes),
             unit=unit[..., None, :],
-            unit_sign=xp.sign(unit)[..., None, :],
+            unit_sign=sign(unit)[..., None, :],
             longer_variables=longer.variables,
             longer_polarity=longer.polarity,
             longer_weight=longer_weight[..., None, :],

@@ -73,7 +73,8 @@ class DmmSolver:
         warm: How later groups begin; None draws new voltages with memories at rest.
         record: Records trajectories, for the time average and for plots; None does not.
         kernel: "compiled" for the CPU; "reference", plain operations on arrays, for any device, field and
-            integrator; or "auto": compiled where it can be.
+            integrator; "cuda" for a CUDA device, wherever the problem lies; or "auto": compiled where it can be on
+            the CPU, else plain.
 
     >>> import numpy as np
     >>> qubo = Qubo.from_matrix(np.array([[1.0, -3.0], [0.0, 1.0]]))
@@ -90,7 +91,7 @@ class DmmSolver:
     quench_every: int | None = None
     warm: WarmRestart | None = None
     record: Recording | None = None
-    kernel: Literal["auto", "compiled", "reference"] = "auto"
+    kernel: Literal["auto", "compiled", "reference", "cuda"] = "auto"
 
     def __post_init__(self) -> None:
         parts = ("integrator", "noise", "spread", "build", "stability", "init", "derivative", "bound")
@@ -129,7 +130,8 @@ class DmmSolver:
                     self.record.every,
                     f"an integer from 1 to max_steps = {self.max_steps}",
                 )
-        check_kernel(self.kernel, self._obstacle("cpu") if self.kernel == "compiled" else None)
+        obstacles = {"compiled": lambda: self._obstacle("cpu"), "cuda": self._cuda_obstacle}
+        check_kernel(self.kernel, obstacles.get(self.kernel, lambda: None)(), ("cuda",))
 
     @np.errstate(under="ignore")
     def minimise(self, problem: Qubo | WeightedMaxSat, *, generator: "Generator") -> QuboSolution:
@@ -213,10 +215,14 @@ class DmmSolver:
     def _run(self, problem: Qubo | WeightedMaxSat, start: Start, n_steps: int) -> Run:
         """Run the kernel that the settings ask for."""
         integrator = self.integrator or self.field.integrator
-        obstacle = None if self.kernel == "reference" else self._obstacle(device_of(start.voltage))
+        obstacle = self._obstacle(device_of(start.voltage)) if self.kernel in ("auto", "compiled") else None
         kernel: Callable[..., Run] = reference.run
         if obstacle is not None:
             _say_once(obstacle)
+        elif self.kernel == "cuda":
+            from memcomp_lightning.solvers.dmm.kernels import cuda
+
+            kernel = cuda.run
         elif self.kernel != "reference":
             from memcomp_lightning.solvers.dmm.kernels import cpu
 
@@ -245,6 +251,14 @@ class DmmSolver:
         if type(integrator) is not Splitting:
             return f"{type(integrator).__name__} has no compiled kernel: use Splitting for speed."
         return FIELDS[type(self.field)].obstacle(self.field)
+
+    def _cuda_obstacle(self) -> str | None:
+        """Why the kernel for CUDA devices cannot run, and what to do; None if it can."""
+        if (reason := obstacle("cpu")) is not None:
+            return reason
+        from memcomp_lightning.solvers.dmm.kernels import cuda
+
+        return cuda.obstacle(self.field, self.integrator or self.field.integrator)
 
 
 class _Part(NamedTuple):

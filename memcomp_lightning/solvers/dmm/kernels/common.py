@@ -92,3 +92,77 @@ def clause(false_first, false_second, short, long, rates):
     rigidity = unsatisfied - agile * unsatisfied
     at_first = rigidity if false_first <= false_second else zero
     return short, long, gradient * false_second + at_first, gradient * false_first + (rigidity - at_first)
+
+
+@inlined
+def unit_rates(c):
+    """What ``unit_clause`` needs of the constants: alpha, delta, cap, pull."""
+    return c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - F32(1), c[UNIT_PULL]
+
+
+@inlined
+def unit_clause(weight, voltage, long, rates, dt):
+    """Advance the memory of a unit clause of signed ``weight``, less 1; return it, and the clause's pull."""
+    alpha, delta, cap, pull = rates
+    zero, half, one = F32(0), F32(0.5), F32(1)
+    sign = half if weight > zero else (-half if weight < zero else zero)
+    excess = dt * alpha * (half - sign * voltage - delta)
+    long = min(cap, max(zero, long + excess * (one if excess > zero else long)))
+    return long, pull * weight * (one + long)
+
+
+@inlined
+def bond_rates(c):
+    """What ``bond`` needs of the constants: lift, satisfied, delta, zeta, low, cap."""
+    one, gamma = F32(1), c[GAMMA]
+    return gamma - one, gamma * c[KAPPA], c[DELTA], c[ZETA], c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
+
+
+@inlined
+def bond(first, second, short, long, rates, dt):
+    """Advance the memories of one bond; ``BondField`` has the equations.
+
+    Args:
+        first: The voltage of one end, times the sign of the bond.
+        second: That of the other end.
+        short: X.
+        long: Y - 1.
+        rates: See ``bond_rates``.
+        dt: The step.
+    """
+    lift, satisfied, delta, zeta, low, cap = rates
+    zero, one = F32(0), F32(1)
+    later = min(cap, max(zero, long + dt * (delta * short - zeta)))
+    return min(one, max(low, short + dt * (lift - long + satisfied * (first * second)))), later
+
+
+@inlined
+def field_rates(c):
+    """What ``bond_field`` needs of the constants: those of memories, drive and pull."""
+    of_memories = (c[GAMMA], c[KAPPA], c[DELTA], c[ZETA], c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - F32(1))
+    return of_memories, c[ALPHA], F32(2) * c[BETA] / c[PULL_SCALE]
+
+
+@inlined
+def bond_field(field, voltage, short, long, drive, pull, rates, dt):
+    """Advance the memories of a field, a bond to a spin at 1.
+
+    Args:
+        field: h.
+        voltage: That of its spin.
+        short: X.
+        long: Y - 1.
+        drive: What the spin's bonds add up to.
+        pull: How strongly they pull it to 0.
+        rates: See ``field_rates``.
+        dt: The step.
+
+    Returns:
+        Both memories, and the rate of the voltage.
+    """
+    (gamma, kappa, delta, zeta, low, cap), alpha, pull_rate = rates
+    zero, one = F32(0), F32(1)
+    sign = one if field > zero else (-one if field < zero else zero)
+    later = min(cap, max(zero, long + dt * (delta * short - zeta)))
+    short = min(one, max(low, short + dt * (gamma * (one + kappa * sign * voltage) - one - long)))
+    return short, later, alpha * (drive + field) - pull_rate * (pull + abs(field) * short) * voltage

@@ -1,39 +1,37 @@
 """The compiled kernels: hand arrays to numba and share the restarts among threads."""
 
-from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 
-from memcomp_lightning.arrays import Array, alike, to_numpy
+from memcomp_lightning.arrays import to_numpy
 from memcomp_lightning.compiling import announce_compilation
 from memcomp_lightning.problems.graph import Bipartite
-from memcomp_lightning.problems.maxsat import WeightedMaxSat, to_qubo
+from memcomp_lightning.problems.maxsat import WeightedMaxSat
 from memcomp_lightning.problems.qubo import Qubo
-from memcomp_lightning.solvers.compiled import (
-    Numbers,
-    float32,
-    forget_outdated,
-    grouped,
-    over,
-    power_of_two,
-    share,
-)
+from memcomp_lightning.solvers.compiled import Numbers, float32, forget_outdated, share
 from memcomp_lightning.solvers.dmm.base import Recording
 from memcomp_lightning.solvers.dmm.bond import BondField
 from memcomp_lightning.solvers.dmm.clause import ClauseField
 from memcomp_lightning.solvers.dmm.integrate import Splitting
 from memcomp_lightning.solvers.dmm.kernels import common, digital, lanes, rows
 from memcomp_lightning.solvers.dmm.kernels.common import BOND
-from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS, Listed
+from memcomp_lightning.solvers.dmm.kernels.fields import FIELDS
+from memcomp_lightning.solvers.dmm.kernels.hand_over import (
+    Steps,
+    constants_of,
+    control_of,
+    finish,
+    outputs,
+    sparse_of,
+    steps_of,
+)
 from memcomp_lightning.solvers.dmm.kernels.prepare import prepare
-from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start, Visited
+from memcomp_lightning.solvers.dmm.kernels.run import Run, Stall, Start
 
 announce_compilation()
-
-Steps = tuple[int, int, int, int, float]
 
 _INLINED = (common, digital, lanes)
 """Modules whose functions become part of kernels that are kept on disk: those of other packages do not."""
@@ -52,9 +50,7 @@ def run(
     remember: bool = True,
 ) -> Run:
     """Do what ``reference.run`` does, on the CPU and in float32."""
-    every = recording.every if recording is not None else 0
-    min_steps, factor = (n_steps, 0.0) if stall is None or every else stall
-    steps = (n_steps, quench_every, every, min_steps, float(factor))
+    steps = steps_of(n_steps, quench_every, recording, stall)
     in_rows = isinstance(field, ClauseField | BondField)
     if in_rows and isinstance(problem, Qubo) and isinstance(problem.graph, Bipartite):
         return _run_rows(field, integrator, problem, problem.graph, start, steps, remember)
@@ -78,8 +74,8 @@ def _run_rows(
     of_problem = {"pull_scale": pull_scale}
     if isinstance(field, ClauseField):
         of_problem = {"long_term_max": field.most_long_term(degree)}
-    constants = _constants(field, common.CONSTANTS, n_problems, of_problem)
-    control = _control(field, integrator, stability)
+    constants = constants_of(field, common.CONSTANTS, n_problems, of_problem)
+    control = control_of(field, integrator, stability)
     # The kernel divides the sum of the squared rates by the number of variables with the padding.
     control[:, common.CHANGE] *= np.sqrt(n / (width + height))
     voltage = _pad(float32(start.voltage), n_first, width, width + height)
@@ -93,7 +89,7 @@ def _run_rows(
         n_kept, sizes = n_restarts if remember else 0, (padded.weight.shape[1], width + height)
         kept = [np.zeros((n_problems, n_kept, size), np.float32) for size in sizes]
     arrays = (padded.kind, padded.sizes, padded.side, constants, *padded[4:])
-    out = _outputs((n_problems, n_restarts), width + height, steps)
+    out = outputs((n_problems, n_restarts), width + height, steps)
     state = (voltage, *kept, to_numpy(start.seed).astype(np.uint64))
     work = padded.weight.size * n_restarts * steps[0]
     share(rows.integrate_all, n_problems * n_restarts, work, (arrays, control, state, steps, *out), _INLINED)
@@ -105,7 +101,7 @@ def _run_rows(
     if remember:
         of_pairs = kept[0][..., : n_second * width].reshape(n_problems, n_restarts, n_second, width)
         memories = [np.ascontiguousarray(of_pairs[..., :n_first]), unpad(kept[1])]
-    return _finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps, start.voltage)
+    return finish((unpad(out[0]), *out[1:4], unpad(out[4])), unpad(voltage), memories, steps, start.voltage)
 
 
 def _pad(x: Numbers, n_first: int, width: int, size: int) -> Numbers:
@@ -158,11 +154,11 @@ def _run_lanes(
 ) -> Run:
     """Listed pairs and longer clauses, one task a block of restarts; idle lanes repeat the first restarts."""
     passes, machine = FIELDS[type(field)], field.build(problem)
-    constants = _constants(field, passes.constants, len(start.voltage), passes.of_problem(field, machine))
-    control = _control(field, integrator, float32(field.stability(machine)).reshape(-1))
+    constants = constants_of(field, passes.constants, len(start.voltage), passes.of_problem(field, machine))
+    control = control_of(field, integrator, float32(field.stability(machine)).reshape(-1))
     n_problems, n_restarts, n = start.voltage.shape
     n_blocks, lanes_each = _blocks(n_restarts)
-    sparse = _sparse(passes.listed(machine), problem, n_problems)
+    sparse = sparse_of(passes.listed(machine), problem, n_problems)
     voltage = _to_lanes(float32(start.voltage), n_blocks, lanes_each)
     # Arrays of numpy lie in huge pages where they can.
     memories = [
@@ -175,7 +171,7 @@ def _run_lanes(
     seed = np.ascontiguousarray(
         _to_lanes(to_numpy(start.seed).astype(np.uint64)[..., None], n_blocks, lanes_each)[:, :, 0]
     )
-    best, *out = _outputs((n_problems, n_blocks, lanes_each), n, steps)
+    best, *out = outputs((n_problems, n_blocks, lanes_each), n, steps)
     best = np.zeros((n_problems, n_blocks, n, lanes_each), np.float32)
     longer = (sparse.variables, sparse.longer_polarity, sparse.longer_weight)
     own = (passes.kind, constants, sparse.pairs, sparse.weight, sparse.polarity, sparse.unit)
@@ -187,104 +183,13 @@ def _run_lanes(
     share(kernel, n_problems * n_blocks, work, (arrays, control, state, steps, best, *out), _INLINED)
     out = [x.reshape(n_problems, n_blocks * lanes_each, *x.shape[3:])[:, :n_restarts] for x in out]
     best, final, *remembered = (_from_lanes(x, n_restarts) for x in (best, voltage, *(long if remember else ())))
-    return _finish((best, *out), final, remembered, steps, start.voltage)
+    return finish((best, *out), final, remembered, steps, start.voltage)
 
 
 @cache
 def _of_this_process() -> Any:
     """The kernel for fields of other packages; on disk it would name types that other processes may not find."""
     return njit(nogil=True)(lanes.integrate_all.py_func)
-
-
-class _Sparse(NamedTuple):
-    """A problem as the lanes kernel reads it."""
-
-    pairs: Numbers
-    weight: Numbers
-    polarity: Numbers
-    unit: Numbers
-    variables: Numbers
-    longer_polarity: Numbers
-    longer_weight: Numbers
-    digital: tuple[Numbers, ...]
-    linear: Numbers
-
-
-def _sparse(listed: Listed, problem: Qubo | WeightedMaxSat, n_problems: int) -> _Sparse:
-    """Flatten a problem and list, for each variable, its pairs and its longer clauses."""
-    pairs = np.ascontiguousarray(to_numpy(problem.graph.edges()))
-    n, n_pairs = problem.n, pairs.shape[0]
-    polarity = np.zeros((n_problems, n_pairs, 2), np.float32)
-    if listed.polarity is not None:
-        polarity = float32(listed.polarity)
-    variables, longer_polarity = np.zeros((0, 3), np.int64), np.zeros((0, 3), np.float32)
-    longer_weight = np.zeros((n_problems, 0), np.float32)
-    if listed.longer is not None:
-        variables = to_numpy(listed.longer[0])
-        longer_polarity, longer_weight = (float32(x) for x in listed.longer[1:])
-    if isinstance(problem, Qubo):
-        quadratic, block_weights = problem, []
-    else:
-        quadratic = to_qubo(problem.without_longer())
-        block_weights = [block.weight for block in problem.longer]
-    weights = np.concatenate([to_numpy(block) for block in block_weights or [quadratic.linear[:, :0]]], axis=-1)
-    parts = (quadratic.coupling.reshape(n_problems, n_pairs), quadratic.linear, weights)
-    coupling, linear, clause_weight = (over(part, power_of_two(*parts)) for part in parts)
-    ends = np.concatenate((pairs[:, 0], pairs[:, 1]))
-    order, offsets = grouped(ends, n)
-    neighbours = np.concatenate((pairs[:, 1], pairs[:, 0]))[order]
-    literal_clause, literal_at = np.nonzero(longer_polarity)
-    clause_order, clause_offsets = grouped(variables[literal_clause, literal_at], n)
-    of_pairs = (offsets, neighbours.astype(np.int32), np.ascontiguousarray(np.tile(coupling, 2)[:, order]))
-    of_clauses = (clause_offsets, literal_clause[clause_order], clause_weight)
-    return _Sparse(
-        pairs.astype(np.int32),
-        float32(listed.weight.reshape(n_problems, n_pairs)),
-        polarity,
-        float32(listed.unit.reshape(n_problems, n)),
-        variables,
-        longer_polarity,
-        longer_weight,
-        (*of_pairs, *of_clauses),
-        linear,
-    )
-
-
-def _constants(field: Any, names: Sequence[str], n_problems: int, of_problem: Mapping[str, Any]) -> Numbers:
-    """Settings of the field as its passes read them, a row a problem; 0 where the field has none of a name."""
-    constants = np.zeros((n_problems, len(names)), np.float32)
-    for index, name in enumerate(names):
-        value = of_problem[name] if name in of_problem else getattr(field, name, 0.0)
-        constants[:, index] = np.asarray(value).reshape(-1)
-    return constants
-
-
-def _control(field: Any, integrator: Splitting, stability: Numbers) -> Numbers:
-    """The step control as the kernels read it, a row a problem."""
-    limits = (integrator.change, integrator.dt_min, integrator.dt_max, field.noise, integrator.lag)
-    control = np.tile(np.array(limits, np.float32), (len(stability), 1))
-    control[:, common.CHANGE] *= stability
-    return control
-
-
-def _outputs(restarts: tuple[int, ...], n: int, steps: Steps) -> tuple[Numbers, ...]:
-    """Best assignment, its step, the last step, record times and states."""
-    n_records = steps[0] // steps[2] if steps[2] else 0
-    return (
-        np.empty((*restarts, n), np.float32),
-        np.empty(restarts, np.int64),
-        np.empty(restarts, np.int64),
-        np.empty((*restarts, n_records)),
-        np.empty((*restarts, n_records, n), np.bool_),
-    )
-
-
-def _finish(out: tuple[Numbers, ...], voltage: Numbers, memories: list[Numbers], steps: Steps, like: Array) -> Run:
-    """The outcome as arrays of the library of the start."""
-    best, found_at, last, times, states = (alike(np.ascontiguousarray(x), like) for x in out)
-    kept = tuple(alike(memory, like) for memory in memories)
-    visited = Visited(times, states) if steps[2] else None
-    return Run(best > 0.5, found_at, last, alike(voltage, like), kept, visited)
 
 
 def _blocks(n_restarts: int) -> tuple[int, int]:

@@ -28,20 +28,21 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     F32,
     FAST_MATH,
     GAMMA,
-    KAPPA,
     LAG,
     LONG_TERM_MAX,
     NOISE,
-    PULL_SCALE,
-    SHORT_TERM_MIN,
     SHORT_TERM_START,
     TINY,
-    UNIT_PULL,
-    ZETA,
+    bond,
+    bond_field,
+    bond_rates,
     clause,
     clause_rates,
+    field_rates,
     inlined,
     uniform,
+    unit_clause,
+    unit_rates,
 )
 from memcomp_lightning.solvers.dmm.kernels.digital import (
     REFRESH,
@@ -98,28 +99,23 @@ def clause_pass(lanes, pairs, weight, polarity, short, long, voltage, rate, buff
 
 
 @inlined
-def bond_pass(lanes, pairs, bond, short, long, voltage, drive, pull, buffers, c):
+def bond_pass(lanes, pairs, weight, short, long, voltage, drive, pull, buffers, c):
     """Advance the memories of all bonds at the present voltages, then add their drive and pull."""
     dt, first, second = buffers
-    none, zero, one = U64(0), F32(0), F32(1)
-    gamma, delta, zeta = c[GAMMA], c[DELTA], c[ZETA]
-    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
-    lift, satisfied = gamma - one, gamma * c[KAPPA]
-    for begin in range(none, U64(bond.size), U64(ROWS)):
-        end, to, at = min(begin + U64(ROWS), U64(bond.size)), none, begin * lanes
+    none, zero, one, rates = U64(0), F32(0), F32(1), bond_rates(c)
+    for begin in range(none, U64(weight.size), U64(ROWS)):
+        end, to, at = min(begin + U64(ROWS), U64(weight.size)), none, begin * lanes
         for e in range(begin, end):
-            sign = one if bond[e] > zero else (-one if bond[e] < zero else zero)
+            sign = one if weight[e] > zero else (-one if weight[e] < zero else zero)
             gather(lanes, first, to, zero, sign, voltage, U64(pairs[e, 0]) * lanes)
             gather(lanes, second, to, zero, one, voltage, U64(pairs[e, 1]) * lanes)
             to += lanes
         for x in range(to):
-            before, y = short[at + x], long[at + x]
-            long[at + x] = min(cap, max(zero, y + dt[x] * (delta * before - zeta)))
-            short[at + x] = min(one, max(low, before + dt[x] * (lift - y + satisfied * (first[x] * second[x]))))
+            short[at + x], long[at + x] = bond(first[x], second[x], short[at + x], long[at + x], rates, dt[x])
         to = none
         for e in range(begin, end):
-            a, b, size = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, abs(bond[e])
-            add(lanes, drive, a, bond[e], second, to)
+            a, b, size = U64(pairs[e, 0]) * lanes, U64(pairs[e, 1]) * lanes, abs(weight[e])
+            add(lanes, drive, a, weight[e], second, to)
             add(lanes, drive, b, size, first, to)
             add(lanes, pull, a, size, short, at + to)
             add(lanes, pull, b, size, short, at + to)
@@ -190,37 +186,27 @@ def spread_out(lanes, values, begin, row):
 def clause_units(lanes, unit, long, voltage, rate, buffers, c):
     """Advance the memories of the unit clauses and add their pull."""
     dt, own, _ = buffers
-    half, one, zero = F32(0.5), F32(1), F32(0)
-    alpha, delta, cap, strength = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
+    rates = unit_rates(c)
     for begin in range(U64(0), U64(unit.size), U64(ROWS)):
         size, at = spread_out(lanes, unit, begin, own), begin * lanes
         for x in range(size):
-            sign = half if own[x] > zero else (-half if own[x] < zero else zero)
-            excess = dt[x] * alpha * (half - sign * voltage[at + x] - delta)
-            y = long[at + x]
-            y = min(cap, max(zero, y + excess * (one if excess > zero else y)))
-            long[at + x] = y
-            rate[at + x] += strength * own[x] * (one + y)
+            long[at + x], pull = unit_clause(own[x], voltage[at + x], long[at + x], rates, dt[x])
+            rate[at + x] += pull
 
 
 @inlined
 def bond_fields(lanes, field, short, long, voltage, drive, pull, buffers, c):
     """Advance the memories of the fields, then turn drive and pull into the rate of the voltages."""
     dt, own, _ = buffers
-    zero, one = F32(0), F32(1)
-    alpha, gamma, kappa, delta, zeta = c[ALPHA], c[GAMMA], c[KAPPA], c[DELTA], c[ZETA]
-    low, cap = c[SHORT_TERM_MIN], c[LONG_TERM_MAX] - one
-    pull_rate = F32(2) * c[BETA] / c[PULL_SCALE]
+    rates = field_rates(c)
     for begin in range(U64(0), U64(field.size), U64(ROWS)):
         size, at = spread_out(lanes, field, begin, own), begin * lanes
         for x in range(size):
-            h, v, before, y = own[x], voltage[at + x], short[at + x], long[at + x]
-            sign = one if h > zero else (-one if h < zero else zero)
-            long[at + x] = min(cap, max(zero, y + dt[x] * (delta * before - zeta)))
-            after = min(one, max(low, before + dt[x] * (gamma * (one + kappa * sign * v) - one - y)))
-            short[at + x] = after
-            drive[at + x] = alpha * (drive[at + x] + h) - pull_rate * (pull[at + x] + abs(h) * after) * v
-            pull[at + x] = zero
+            v, before, y = voltage[at + x], short[at + x], long[at + x]
+            short[at + x], long[at + x], drive[at + x] = bond_field(
+                own[x], v, before, y, drive[at + x], pull[at + x], rates, dt[x]
+            )
+            pull[at + x] = F32(0)
 
 
 @inlined

@@ -33,12 +33,13 @@ from memcomp_lightning.solvers.dmm.kernels.common import (
     SHORT_TERM_MIN,
     SHORT_TERM_START,
     TINY,
-    UNIT_PULL,
     ZETA,
     clause,
     clause_rates,
     inlined,
     uniform,
+    unit_clause,
+    unit_rates,
 )
 from memcomp_lightning.solvers.dmm.kernels.digital import (
     REFRESH,
@@ -88,15 +89,10 @@ def clause_pass(n_first, n_second, weight, side, short, long, voltage, drive, c,
 @inlined
 def clause_units(unit, long, voltage, drive, c, dt):
     """Advance the memories of the unit clauses and add their pull."""
-    half, one = F32(0.5), F32(1)
-    alpha, delta, cap, pull = c[ALPHA], c[DELTA], c[LONG_TERM_MAX] - one, c[UNIT_PULL]
+    rates = unit_rates(c)
     for i in range(unit.size):
-        u = unit[i]
-        sign = half if u > 0 else (-half if u < 0 else F32(0))
-        excess = dt * alpha * (half - sign * voltage[i] - delta)
-        x = long[i]
-        long[i] = min(cap, max(F32(0), x + excess * (one if excess > 0 else x)))
-        drive[i] += pull * u * (one + long[i])
+        long[i], pull = unit_clause(unit[i], voltage[i], long[i], rates, dt)
+        drive[i] += pull
 
 
 @inlined

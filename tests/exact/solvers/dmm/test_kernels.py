@@ -24,7 +24,7 @@ from memcomp_lightning.problems.maxsat import Clauses
 from memcomp_lightning.solvers import Status
 from memcomp_lightning.solvers.compiled import forget_outdated
 from memcomp_lightning.solvers.dmm import BondField, ClauseField, DmmSolver, Recording, Splitting, WarmRestart
-from memcomp_lightning.solvers.dmm.kernels import common, cpu, lanes, prepare, reference, rows
+from memcomp_lightning.solvers.dmm.kernels import common, cpu, hand_over, lanes, prepare, reference, rows
 from memcomp_lightning.solvers.dmm.kernels import digital as digital_state
 from memcomp_lightning.solvers.dmm.kernels import fields as compiled_fields
 from memcomp_lightning.solvers.dmm.kernels.run import Stall, Start
@@ -531,7 +531,7 @@ def test_local_fields_and_energies_follow_the_flips(name, lanes):
     """In each lane by itself."""
     problem = EVERY[name]
     n_problems, n = problem.offset.shape[0], problem.n
-    sparse = cpu._sparse(
+    sparse = hand_over.sparse_of(
         compiled_fields.FIELDS[ClauseField].listed(ClauseField().build(problem)), problem, n_problems
     )
     generator, width = rng.stream(5, "flips"), np.uint64(lanes)
