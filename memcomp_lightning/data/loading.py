@@ -262,8 +262,8 @@ class Batches:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
         weight, share = self._weights(positions, order), 1.0
         if positions != chunk.step or self._of_steps:  # a device would be waited for; alike for all seeds
-            alone = not self._of_steps
-            of_step = float(self._weights(chunk.step, order).sum()) if alone else self._of_steps[chunk.number]
+            of_own = float(self._weights(chunk.step, order).sum())
+            of_step = self._of_steps[chunk.number] if self._of_steps else of_own
             share = self._world_size * float(weight.sum()) / of_step
         return Batch(v, label, share, chunk.closes_step, weight, observed)
 
