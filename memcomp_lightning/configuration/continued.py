@@ -111,8 +111,8 @@ def finished(path: Path) -> RunFolder:
         raise UserError(f"continue={path}: that run has not finished. Finish it: memcomp-train resume={path}")
     if folder.schema is None:
         raise UserError(
-            f"continue={path}: that run is of version {folder.version}, whose settings this one does not read. Begin "
-            f"a run with its weights: model.weights={folder.weights('pretrain')}"
+            f"continue={path}: that run is of version {folder.version}, whose settings this one does not read. "
+            f"Begin a run with its weights: model.weights={folder.weights('pretrain')}"
         )
     return folder
 

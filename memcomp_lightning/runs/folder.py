@@ -232,9 +232,9 @@ class RunFolder:
             if not (name.startswith(_FREE_TO_CHANGE) or old == new or self._same_path(name, old, new)):
                 if self.version != __version__:
                     raise UserError(
-                        f"run folder {self.path} was made by version {self.version}, with {name}={old}; it is {new} "
-                        f"in this one, {__version__}. Go on with that version, or begin anew in another folder with "
-                        "hydra.run.dir=PATH."
+                        f"run folder {self.path} was made by version {self.version}, with {name}={old}; in this "
+                        f"one, {__version__}, it is {new}. Go on with that version, or begin anew in another "
+                        "folder with hydra.run.dir=PATH."
                     )
                 raise UserError(
                     f"run folder {self.path} was made with {name}={old}, not {new}: choose another with "
