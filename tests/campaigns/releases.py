@@ -76,7 +76,8 @@ import memcomp_lightning
 run = memcomp_lightning.load("run")
 print(run.model.energy, run.classifier, run.schema)
 """
-_QUICK = ("pretrain.iterations=1", "finetune.iterations=1", "callbacks=minimal", "logger=none")
+_QUICK = ("data=digits", "pretrain.iterations=1", "callbacks=minimal", "logger=none")
+_CLASSES, _NO_CLASSES = "finetune.iterations=1", "finetune.iterations=0"
 _FIGURE = (
     *("experiment=figure4", "figure/curves=none", "data=digits", "data.partitions=2", "figure.passes=[1]"),
     *("figure.seeds=[0]", "figure.iterations=[1]", "solver.max_steps=20", "solver.n_restarts=3"),
@@ -84,8 +85,8 @@ _FIGURE = (
 )
 FIRST = (
     ("memcomp-train", "--help"),
-    ("memcomp-train", "data=digits", "sampler=dmm_qubo", *_QUICK, "hydra.run.dir=dbn"),
-    ("memcomp-train", "data=digits", "model=rbm", "sampler=pcd", *_QUICK, "hydra.run.dir=run"),
+    ("memcomp-train", "sampler=dmm_qubo", *_QUICK, _CLASSES, "hydra.run.dir=dbn"),
+    ("memcomp-train", "model=rbm", "sampler=pcd", *_QUICK, _NO_CLASSES, "hydra.run.dir=run"),
     ("python", "-c", LOADS),
     ("memcomp-sample", "run", "n=5", "output=digits.npz"),
     ("memcomp-train", "resume=run"),
@@ -98,9 +99,9 @@ FIRST = (
 
 _TABLE = (
     *("data=table", "data.path=people.csv", "model.hidden_sizes=[4]", "pretrain.updates=50"),
-    *("pretrain.iterations=null", "finetune.iterations=0", "callbacks=minimal"),
+    *("pretrain.iterations=null", _NO_CLASSES, "callbacks=minimal"),
 )
-_SWEEP = ("-m", "data=digits", "sampler=cd,pcd", *_QUICK, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+_SWEEP = ("-m", "sampler=cd,pcd", *_QUICK, _CLASSES, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 WITH_EXTRAS = (
     ("memcomp-train", *_TABLE, "hydra.run.dir=table"),
     ("memcomp-sample", "table", "n=5", "output=rows.csv"),
