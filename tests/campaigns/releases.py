@@ -219,7 +219,7 @@ def reproducible(folder: Path) -> ledger.Outcome:
         source.extractall(folder / "unpacked", filter="data")
     unpacked = next((folder / "unpacked").iterdir())
     directly = built(trees[1], folder / "dist_2", "--wheel")
-    findings += [f"holds {name}" for name in stray(unpacked, files)]
+    findings += stray(unpacked, files)
     pairs = [*zip(*archives, strict=True), (wheels_of[0], directly[0])]
     findings += [f"differs: {where}" for pair in pairs if (where := differing(*pair)) is not None]
     findings += misplaced(wheels_of[0], files)
@@ -228,9 +228,14 @@ def reproducible(folder: Path) -> ledger.Outcome:
 
 
 def stray(unpacked: Path, files: Sequence[Path]) -> list[str]:
-    """What a source archive holds beside the tree's own files."""
+    """What a source archive holds beside the tree's own files, and what it lacks of them."""
     found = {path.relative_to(unpacked) for path in unpacked.rglob("*") if path.is_file() or path.is_symlink()}
-    return sorted(name.as_posix() for name in found - {*files, Path("PKG-INFO")})
+    # How the project's own machines run it, and the link for editable installs.
+    expected = {name for name in files if name.parts[0] != ".ci" and name != Path("memcomp_lightning/conf")}
+    return [
+        *(f"the source archive holds {name}" for name in sorted(found - expected - {Path("PKG-INFO")})),
+        *(f"the source archive lacks {name}" for name in sorted(expected - found)),
+    ]
 
 
 def described(folder: Path) -> ledger.Outcome:

@@ -45,10 +45,14 @@ def test_files_that_are_missing_or_too_many_are_named(tmp_path: Path) -> None:
         "y.whl lacks memcomp_lightning/conf/b.yaml",
         "y.whl holds tests/c.py",
     ]
-    (tmp_path / "unpacked/tests").mkdir(parents=True)
-    for name in ("PKG-INFO", "tests/c.py", "stray"):
+    for name in ("PKG-INFO", "memcomp_lightning/a.py", "conf/b.yaml", "tests/c.py"):
+        (tmp_path / "unpacked" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "unpacked" / name).touch()
-    assert releases.stray(tmp_path / "unpacked", files) == ["stray"]
+    assert releases.stray(tmp_path / "unpacked", files) == []
+    (tmp_path / "unpacked/tests/c.py").rename(tmp_path / "unpacked/d.py")
+    assert releases.stray(tmp_path / "unpacked", files) == [
+        *("the source archive holds d.py", "the source archive lacks tests/c.py"),
+    ]
 
 
 def test_a_command_that_fails_is_a_finding_with_what_it_said(tmp_path: Path) -> None:
