@@ -107,7 +107,7 @@ WITH_EXTRAS = (
     ("memcomp-sample", "table", "n=5", "output=rows.csv"),
     ("memcomp-score", "table", "people.csv", "output=scores.csv"),
     ("memcomp-impute", "table", "people.csv", "output=filled.csv"),
-    ("memcomp-transform", "table", "people.csv", "output=features.parquet"),
+    ("memcomp-transform", "table", "filled.csv", "output=features.parquet"),
     *(
         ("memcomp-export", "run", f"format={name}", f"output=model.{ending}")
         for name, ending in (("safetensors", "safetensors"), ("onnx", "onnx"), ("rbms", "h5"))
