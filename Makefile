@@ -3,13 +3,14 @@
 # make test       the whole suite: what CI runs
 # make lint       linters and types alone
 # make docs       the site, into site/
+# make versioned-docs  the same into the branch gh-pages, beside those of earlier versions
 # make notebooks  the notebooks in Jupyter
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: train check test lint lint-but-types types unit-and-exact whole-suite docs notebooks
+.PHONY: train check test lint lint-but-types types unit-and-exact whole-suite docs versioned-docs notebooks
 
 train: $(VENV)/.installed
 	$(BIN)/memcomp-train data=digits sampler=dmm_qubo
@@ -43,6 +44,12 @@ whole-suite: $(VENV)/.installed-dev
 # Strictly: a broken link or an unknown name ends it. The variable silences an advertisement.
 docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+
+# A folder for each minor version; people land in that of the last release. Nothing is pushed.
+versioned-docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mike deploy --update-aliases \
+		"$$($(BIN)/python -c 'from memcomp_lightning import __version__; print(__version__.rpartition(".")[0])')" latest
+	$(BIN)/mike set-default latest
 
 # Opens the text notebooks in Jupyter; what is changed there goes back into the text.
 notebooks: $(VENV)/.installed

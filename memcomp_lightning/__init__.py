@@ -1,6 +1,6 @@
 """Train restricted Boltzmann machines and deep belief networks, with a choice of samplers for the gradient."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = ["load", "solve"]
 
 TYPE_CHECKING = False  # typing takes time before Ctrl-C is answered

@@ -109,6 +109,11 @@ def finished(path: Path) -> RunFolder:
         )
     if folder.result is None:
         raise UserError(f"continue={path}: that run has not finished. Finish it: memcomp-train resume={path}")
+    if folder.schema is None:
+        raise UserError(
+            f"continue={path}: that run is of version {folder.version}, whose settings this one does not read. "
+            f"Begin a run with its weights: model.weights={folder.weights('pretrain')}"
+        )
     return folder
 
 

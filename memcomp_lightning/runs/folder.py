@@ -107,6 +107,13 @@ class RunFolder:
         """The folder in which the run was started: relative paths in its overrides start there."""
         return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
 
+    @property
+    def version(self) -> str:
+        """Which version made it, for people."""
+        begun = (self._read("overrides.json") or {}).get("memcomp_lightning")
+        ended = ((self.result or {}).get("origin") or {}).get("memcomp_lightning")
+        return str(begun or ended or "before 0.3.0")
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep other processes out; a UserError if one is in, or the folder cannot be written."""
@@ -127,7 +134,8 @@ class RunFolder:
             if (settings := self.settings) is not None:
                 self._check_same(settings, config)
             else:
-                write_json(self.path / "overrides.json", {"overrides": list(overrides), "folder": str(Path.cwd())})
+                typed = {"overrides": list(overrides), "folder": str(Path.cwd()), "memcomp_lightning": __version__}
+                write_json(self.path / "overrides.json", typed)
                 write_text(self.path / "settings.yaml", OmegaConf.to_yaml(config))
         except OSError as error:
             if lost(error) is not None:  # another folder would not help
@@ -222,6 +230,12 @@ class RunFolder:
         for name in sorted(there.keys() | now.keys()):
             old, new = there.get(name), now.get(name)
             if not (name.startswith(_FREE_TO_CHANGE) or old == new or self._same_path(name, old, new)):
+                if self.version != __version__:
+                    raise UserError(
+                        f"run folder {self.path} was made by version {self.version}, with {name}={old}; in this "
+                        f"one, {__version__}, it is {new}. Go on with that version, or begin anew in another "
+                        "folder with hydra.run.dir=PATH."
+                    )
                 raise UserError(
                     f"run folder {self.path} was made with {name}={old}, not {new}: choose another with "
                     "hydra.run.dir=PATH (hydra.sweep.dir=PATH for a sweep), or use the same settings."

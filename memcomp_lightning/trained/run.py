@@ -165,7 +165,7 @@ def _place_of(path: Path) -> _Place | None:
         (path.parent.parent.parent, path.parent.parent.name, path.parent.name),
     ):
         fits = kind == ("weights" if path.suffix == ".pt" else "checkpoints")
-        if fits and stage in ("pretrain", "finetune") and RunFolder(folder).overrides is not None:
+        if fits and stage in ("pretrain", "finetune") and RunFolder(folder).schema is not None:
             return _Place(folder, path, stage)
     return None
 
@@ -199,9 +199,14 @@ def _read_folder(path: Path, replica: int | None, trusted: Collection[str], plac
         raise UserError(f"{path} is no run folder of memcomp-train: it has no settings.yaml and overrides.json.")
     content = folder.schema
     if content is None:
+        left = [folder.weights(name) for name in ("finetune", "pretrain") if folder.weights(name).is_file()]
+        if left:
+            raise UserError(
+                f"{path} has no schema.json, as runs of versions before 0.3.0 have none (this one is of version "
+                f"{folder.version}): name its weights in place of the folder, {' or '.join(map(str, left))}"
+            )
         raise UserError(
-            f"{path} has no schema.json: its training has not begun, or was made by an earlier version. Go on "
-            f"with memcomp-train resume={path}"
+            f"{path} has no schema.json: its training has not begun. Go on with memcomp-train resume={path}"
         )
     schema = schema_of(content)
     for part in ("units", "model", "finetune"):

@@ -78,7 +78,19 @@ def test_one_version_everywhere() -> None:
             "name" in author or {"family-names", "given-names"} <= author.keys() for author in work["authors"]
         )
     assert all({"type", "title"} <= reference.keys() for reference in citation["references"])
-    assert (ROOT / "CHANGELOG.md").read_text().count("## [Unreleased]") == 1
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    assert changelog.count("## [Unreleased]") == 1
+    # Of a version under way, such as 0.4.0a1, there is no heading yet.
+    if re.fullmatch(r"[\d.]+", project["version"]):
+        assert f"## [{project['version']}] - {citation['date-released']}\n" in changelog
+
+
+def test_the_pythons_of_the_metadata_are_those_of_ci() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    told = [line.rpartition(" ")[2] for line in project["classifiers"] if "Python :: 3." in line]
+    workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+    assert workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == told
+    assert project["requires-python"] == f">={told[0]}"
 
 
 @pytest.mark.parametrize("from_wheel", [True, False], ids=["wheel", "editable"])
