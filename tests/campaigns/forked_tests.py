@@ -29,7 +29,7 @@ WARM = (
     *("pyarrow.parquet", "coverage", "networkx", "dimod"),
 )
 MOST_MEMORY = 16 * 2**30
-MOST_SECONDS_OF_A_TEST = 60
+MOST_SECONDS_OF_A_TEST = 15
 """Without numba a few tests would take an hour: what takes longer is not asked."""
 
 
@@ -130,6 +130,15 @@ class Mapped:
         self.bad: set[str] = set()
         self.fixtures: dict[str, list[str]] = {}
         self.now = ""
+        self.collecting = 0.0
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_collection(self) -> Iterator[Any]:
+        began = time.monotonic()
+        try:
+            return (yield)
+        finally:
+            self.collecting = time.monotonic() - began
 
     def _switch(self, context: str) -> None:
         self.coverage.switch_context(context)
@@ -186,7 +195,7 @@ class Mapped:
 
 
 def mapped(tree: Path, test_file: str, sources: Sequence[str]) -> dict[str, Any]:
-    """Run one file of tests in this process: the seconds of each that passes, and the lines it runs."""
+    """Run one file of tests in this process: how long its collection and each test take, which lines each runs."""
     import coverage
 
     measuring = coverage.Coverage(
@@ -197,7 +206,8 @@ def mapped(tree: Path, test_file: str, sources: Sequence[str]) -> dict[str, Any]
     _pytest(tree, [test_file], [plugin], bytecode=True)
     measuring.stop()
     seconds = {test: s for test, s in plugin.seconds.items() if test not in plugin.bad}
-    return {"seconds": seconds, "bad": sorted(plugin.bad), "lines": plugin.lines(tree)}
+    found = {"collecting": plugin.collecting, "seconds": seconds, "bad": sorted(plugin.bad)}
+    return found | {"lines": plugin.lines(tree)}
 
 
 def digest(files: Iterable[Path]) -> str:

@@ -11,6 +11,7 @@ With ``--again FOLDER`` the cases are those that survived in another folder, in 
 other folder knows of tests that have not changed is kept.
 """
 
+import difflib
 import json
 import os
 import random
@@ -37,9 +38,9 @@ SOURCES = [f"memcomp_lightning/{package}/*" for package in PACKAGES]
 TESTS = ("unit", "exact", "statistical")
 COPIED = ("memcomp_lightning", "tests", "conf", "docs", "experiments", "notebooks", "pyproject.toml", "README.md")
 SEED = 0
-FIRST = 25
-"""Tests that are tried in one process before all others are collected."""
-MOST_SECONDS = 120
+FIRST = 2.0
+"""Seconds of files of tests, with their collection, that are tried in one process before all others are."""
+MOST_SECONDS = 60
 """Of tests for one mutant; those of module level could be all."""
 PATIENCE = 5
 """Times the usual duration after which a mutant counts as killed by time."""
@@ -107,37 +108,56 @@ def write(found: object, place: Path) -> None:
 
 
 class Map:
-    """Which tests run which lines, and how long each takes."""
+    """Which tests run which lines, how long each takes, and how long the collection of each file takes."""
 
     def __init__(self, files: Iterable[Path]) -> None:
         self.seconds: dict[str, float] = {}
+        self.collecting: dict[str, float] = {}
         self.tests: dict[str, dict[str, frozenset[int]]] = {}
         self.imported: dict[str, set[int]] = {}
         for file in files:
             found = json.loads(file.read_text())
             self.seconds |= found["seconds"]
+            self.collecting |= {_file(test): found["collecting"] for test in found["seconds"]}
             for source, tests in found["lines"].items():
                 self.imported.setdefault(source, set()).update(tests.pop("", ()))
                 self.tests.setdefault(source, {}).update((test, frozenset(lines)) for test, lines in tests.items())
 
-    def of(self, source: str, lines: range) -> list[str]:
-        """Tests for a change in these lines, the quickest of each test function first.
+    def of(self, source: str, lines: range) -> tuple[list[str], list[str]]:
+        """Tests for a change in these lines: those to begin with, and the others.
 
-        What runs when its module is imported concerns each test that runs some line of the file.
+        What runs when its module is imported concerns each test that runs some line of the file. One begins with
+        the quickest of each test function, in the files that are quickest with their collection.
         """
         tests = self.tests.get(source, {})
         chosen = [test for test, run in tests.items() if not run.isdisjoint(lines)]
         if not self.imported.get(source, set()).isdisjoint(lines):
             chosen = list(tests)
         chosen.sort(key=self.seconds.__getitem__)
-        nth: dict[str, int] = {}
-        turn = {}
+        first: dict[str, str] = {}
         for test in chosen:
-            function = test.partition("[")[0]
-            nth[function] = turn[test] = nth.get(function, -1) + 1
-        chosen.sort(key=lambda test: (turn[test], self.seconds[test]))
-        total = accumulate(self.seconds[test] for test in chosen)
-        return [test for test, seconds in zip(chosen, total, strict=True) if seconds <= MOST_SECONDS]
+            first.setdefault(test.partition("[")[0], test)
+        total = dict.fromkeys(map(_file, chosen), 0.0)
+        for test in first.values():
+            total[_file(test)] += self.seconds[test]
+        files = sorted(total, key=lambda file: self.collecting[file] + total[file])
+        spent = accumulate(self.collecting[file] + total[file] for file in files)
+        begun = {
+            file for number, (file, s) in enumerate(zip(files, spent, strict=True)) if not number or s < FIRST
+        }
+        begin = [test for test in first.values() if _file(test) in begun]
+        spent = accumulate(self.seconds[test] for test in chosen)
+        others = [test for test, s in zip(chosen, spent, strict=True) if s < MOST_SECONDS and test not in {*begin}]
+        return begin, others
+
+    def expected(self, tests: Iterable[str]) -> float:
+        """Seconds for the collection of their files and for the tests."""
+        tests = list(tests)
+        return sum(self.collecting[file] for file in {*map(_file, tests)}) + sum(self.seconds[t] for t in tests)
+
+
+def _file(test: str) -> str:
+    return test.partition("::")[0]
 
 
 @cache
@@ -190,14 +210,14 @@ def tried(mutant: Mutant, file: Path, *, tree: Path, known: Map, folder: Path) -
     began = time.monotonic()
     original = file.read_text(encoding="utf-8")
     source = str(file.relative_to(tree))
-    tests = known.of(source, statement(original, mutant.line))
+    begin, others = known.of(source, statement(original, mutant.line))
     changed = mutant.of(original)
     said: dict[str, float | str] = {"outcome": "survived", "change": _difference(original, changed)}
-    said |= {"tests": len(tests), "ran": 0}
-    if not tests:
+    said |= {"tests": len(begin) + len(others), "ran": 0}
+    if not begin:
         return said | {"outcome": "not covered"}
     with mutated(file, changed):
-        for some in filter(None, (tests[:FIRST], tests[FIRST:])):
+        for some in filter(None, (begin, others)):
             killed_by = _killer(some, tree, known, folder)
             said["ran"] = int(said["ran"]) + len(some)
             if killed_by is not None:
@@ -207,7 +227,7 @@ def tried(mutant: Mutant, file: Path, *, tree: Path, known: Map, folder: Path) -
 
 
 def _killer(tests: Sequence[str], tree: Path, known: Map, folder: Path) -> str | None:
-    seconds = START + PATIENCE * sum(known.seconds[test] for test in tests)
+    seconds = START + PATIENCE * known.expected(tests)
     log = folder / "logs" / f"mutant-{os.getpid()}.txt"
     try:
         found = in_a_fork(lambda: forked_tests.outcome(tree, tests), seconds=seconds, log=log)
@@ -234,11 +254,10 @@ def mutated(file: Path, text: str) -> Iterator[None]:
 
 
 def _difference(before: str, after: str) -> str:
-    """The first line that differs, before and after."""
-    for old, new in zip(before.splitlines(), after.splitlines(), strict=False):
-        if old != new:
-            return f"`{old.strip()}` -> `{new.strip()}`"
-    return "the end is cut off"
+    """The lines that differ, before and after."""
+    lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm=""))[3:]
+    old, new = (" ".join(line[1:].strip() for line in lines if line[0] == sign) for sign in "-+")
+    return f"`{old}` -> `{new}`"
 
 
 # -------------------------------------------------------------------------------------------------- the campaign

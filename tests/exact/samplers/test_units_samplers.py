@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import units
+from memcomp_lightning.models import DBM, RBM, units
 from memcomp_lightning.models.bit_form import at_real_means
 from memcomp_lightning.samplers import BlockAnnealing, GroundState, ModeAssisted, ModeSchedule, one_hot
+from memcomp_lightning.samplers.ground_state import posed_as
 from memcomp_lightning.samplers.mode_assisted import mode_scale
 from memcomp_lightning.samplers.one_hot import bits_of
 from memcomp_lightning.solvers import (
@@ -190,3 +191,15 @@ def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
     stream = rng.stream(0, "negative_phase")
     found = blocks.sample(model, blocks.init(model, 1, generator=stream), positive, generator=stream)
     torch.testing.assert_close(found.info["mode_scale"], expected.squeeze(), check_dtype=False)
+
+
+def test_solvers_get_a_matrix_where_it_is_mostly_filled():
+    dense = small_dbm()
+    posed, order = posed_as(dense)
+    assert isinstance(posed, RBM)
+    x = rng.bernoulli(torch.full((5, dense.n_units), 0.5), generator=rng.stream(0, "states"))
+    of_posed = posed.energy(*x.split((posed.n_visible, posed.n_hidden), dim=-1))
+    of_dense = dense.energy(*x[:, order].split((dense.n_visible, dense.n_hidden), dim=-1))
+    torch.testing.assert_close(of_posed - of_posed[0], of_dense - of_dense[0])
+    for sparse in (DBM(2, [2] * 7), small_machine(), small_rbm()):  # 28 of 64 couplings; no two classes; a matrix
+        assert posed_as(sparse) == (sparse, None)
