@@ -18,6 +18,7 @@ from memcomp_lightning.solvers import (
     CrossoverAnnealing,
     GibbsAnnealing,
     Portfolio,
+    Status,
     TabuSearch,
 )
 from memcomp_lightning.solvers.dmm import DmmSolver
@@ -203,3 +204,9 @@ def test_solvers_get_a_matrix_where_it_is_mostly_filled():
     torch.testing.assert_close(of_posed - of_posed[0], of_dense - of_dense[0])
     for sparse in (DBM(2, [2] * 7), small_machine(), small_rbm()):  # 28 of 64 couplings; no two classes; a matrix
         assert posed_as(sparse) == (sparse, None)
+
+
+def test_a_proof_of_a_state_in_groups_stays_one():
+    model = MODELS["Potts RBM"]()
+    answers = one_hot.minimise_in_groups(model, model.in_bits(), BruteForce(), generator=rng.stream(0, "solver"))
+    assert (answers.solution.status == int(Status.OPTIMAL)).all()
