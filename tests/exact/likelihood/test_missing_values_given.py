@@ -18,7 +18,7 @@ from memcomp_lightning.likelihood.missing import (
     finders,
     of_observed,
 )
-from memcomp_lightning.likelihood.missing.base import SHARES, real_entries
+from memcomp_lightning.likelihood.missing.base import SHARES, drawn, real_entries
 from memcomp_lightning.likelihood.missing.choice import missing_bits
 from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
@@ -275,3 +275,11 @@ def test_rows_take_about_the_memory_that_is_said(way: Any, model: Any, m: int) -
         most.append(held.most)
     a_row = (most[1] - most[0]) / 200
     assert way.numbers_a_row(model, m) / 8 < a_row < 4 * way.numbers_a_row(model, m)
+
+
+def test_a_number_that_rounding_makes_the_whole_sum_draws_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rng, "uniform", lambda size, **_: torch.ones(size))
+    assert (
+        drawn(torch.tensor([[0.25, 0.75], [1.0, 0.0]]), 3, generator=rng.stream(0, "draws")).tolist()
+        == [[1, 1]] * 3
+    )
