@@ -249,6 +249,17 @@ def test_every_draw_is_the_likelihood_where_recognition_is_right():
     assert bound.standard_error.max() < 1e-12
 
 
+@pytest.mark.parametrize("n_draws", [2, 16])
+def test_the_error_of_a_bound_is_its_spread_over_copies_of_a_row(n_draws):
+    model = model_of(sizes=(3, 2, 2))
+    rows = torch.stack(states_of(N)[:2]).repeat_interleave(2000, dim=0)
+    log_z = log_partition_function(model.top)
+    found = recognition_bound(model, rows, log_z, n_draws=n_draws, generator=rng.stream(0, "bound"))
+    spread = found.value.view(2, 2000).std(-1)
+    said = found.standard_error.view(2, 2000).square().mean(-1).sqrt()
+    torch.testing.assert_close(said, spread, rtol=0.15, atol=0)
+
+
 def test_three_layers_have_a_bound_below_the_likelihood():
     model = model_of(sizes=(3, 2, 2))
     v = torch.stack(states_of(N))
