@@ -1,6 +1,8 @@
 """Missing values given the observed ones, of models of all kinds of units, against sums over all states."""
 
+import itertools
 import weakref
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +21,7 @@ from memcomp_lightning.likelihood.missing import (
     of_observed,
 )
 from memcomp_lightning.likelihood.missing.base import SHARES, drawn, real_entries
+from memcomp_lightning.likelihood.missing.chains import COMPONENTS, _swept
 from memcomp_lightning.likelihood.missing.choice import missing_bits
 from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
@@ -283,3 +286,17 @@ def test_a_number_that_rounding_makes_the_whole_sum_draws_the_last(monkeypatch: 
         drawn(torch.tensor([[0.25, 0.75], [1.0, 0.0]]), 3, generator=rng.stream(0, "draws")).tolist()
         == [[1, 1]] * 3
     )
+
+
+@pytest.mark.parametrize("every", [1, 3, 4])
+def test_components_are_spread_over_the_sweeps(every: int) -> None:
+    number = itertools.count()
+    ladders: Any = SimpleNamespace(
+        model=SimpleNamespace(n_visible=1),
+        n=1,
+        n_chains=1,
+        x=torch.zeros(1, 1),
+        sweep=lambda *_, **__: torch.tensor([[next(number)]]),
+    )
+    sums = _swept(ladders, every * COMPONENTS, torch.tensor([0]), rng.stream(0, "sweeps"))
+    assert sums.components.flatten().tolist() == [*range(0, every * COMPONENTS, every)]

@@ -18,6 +18,7 @@ from memcomp_lightning.solvers import (
     CrossoverAnnealing,
     GibbsAnnealing,
     Portfolio,
+    QuboSolution,
     Status,
     TabuSearch,
 )
@@ -210,3 +211,20 @@ def test_a_proof_of_a_state_in_groups_stays_one():
     model = MODELS["Potts RBM"]()
     answers = one_hot.minimise_in_groups(model, model.in_bits(), BruteForce(), generator=rng.stream(0, "solver"))
     assert (answers.solution.status == int(Status.OPTIMAL)).all()
+    assert answers.info["feasible_sites"] == 1
+
+
+def test_groups_that_an_answer_breaks_are_counted():
+    class FirstGroup:
+        """Has one bit in the first group, and none in the others."""
+
+        def minimise(self, qubo, *, generator):
+            state = torch.zeros(1, qubo.n)
+            state[0, 0] = 1
+            number = torch.zeros(1, dtype=torch.long)
+            return QuboSolution(state, qubo.energy(state), number + int(Status.CONVERGED), number, 0.0)
+
+    model = MODELS["Potts RBM"]()
+    answers = one_hot.minimise_in_groups(model, model.in_bits(), FirstGroup(), generator=rng.stream(0, "solver"))
+    torch.testing.assert_close(answers.info["feasible_sites"], torch.tensor(1 / 3))
+    assert (answers.solution.status == int(Status.CONVERGED)).all()
