@@ -388,7 +388,7 @@ def test_what_cannot_be_is_refused():
         UpDownStep().add_gradient(model, batch, StepState(), streams=streams())
     with pytest.raises(SettingError, match="sampler = 'PseudoLikelihood'"):
         UpDownStep(top=EnergyStep(sampler=PseudoLikelihood()))
-    with pytest.raises(SettingError, match="label"):
+    with pytest.raises(SettingError, match="label = 'a tensor' is not allowed: expected None"):
         model_of().samples(3, sweeps=1, label=torch.zeros(3, dtype=torch.long), generator=rng.stream(0, "x"))
     log_z = torch.tensor(0.0)
     with pytest.raises(SettingError, match="v in column"):

@@ -1,6 +1,7 @@
 """Ground states of models of all units, by each solver and by annealing in blocks, against enumeration."""
 
 from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
@@ -228,3 +229,13 @@ def test_groups_that_an_answer_breaks_are_counted():
     answers = one_hot.minimise_in_groups(model, model.in_bits(), FirstGroup(), generator=rng.stream(0, "solver"))
     torch.testing.assert_close(answers.info["feasible_sites"], torch.tensor(1 / 3))
     assert (answers.solution.status == int(Status.CONVERGED)).all()
+
+
+@pytest.mark.parametrize("n_sweeps", [1, 2, 3, 4, 50])
+def test_sweeps_get_colder_by_one_factor_from_first_to_last(n_sweeps):
+    betas = BlockAnnealing(n_sweeps=n_sweeps, beta_first=0.2, beta_last=5.0).betas()
+    assert len(betas) == n_sweeps
+    assert betas[0] == pytest.approx(0.2)
+    if n_sweeps > 1:
+        assert betas[-1] == pytest.approx(5.0)
+        assert [b / a for a, b in pairwise(betas)] == pytest.approx([25 ** (1 / (n_sweeps - 1))] * (n_sweeps - 1))
