@@ -281,20 +281,26 @@ def table(lines: Iterable[dict[str, Any]]) -> str:
 
 
 def unsound(lines: Iterable[dict[str, Any]], folder: Path) -> Iterator[str]:
-    """Killing tests that fail alone without a mutant, too."""
-    killers = sorted({str(line["facts"].get("by")) for line in lines if line["facts"]["outcome"] == "killed"})
+    """Killing tests that fail without a mutant, too."""
+    killers: dict[str, set[str]] = {}
+    for line in lines:
+        test = str(line["facts"].get("by"))
+        if line["facts"]["outcome"] == "killed" and "::" in test:
+            killers.setdefault(_file(test), set()).add(test)
     place = folder / "sound.json"
     sound = set(json.loads(place.read_text())) if place.exists() else set()
-    for test in killers:
-        if "::" not in test or test in sound:
-            continue
-        log = folder / "logs" / "sound.txt"
-        found = in_a_fork(lambda test=test: forked_tests.outcome(folder / "tree", [test]), seconds=600, log=log)
-        if found is not None and found["status"] == 0:
-            sound.add(test)
+    for tests in killers.values():
+        left = sorted(tests - sound)
+        while left:
+            run = partial(forked_tests.outcome, folder / "tree", left)
+            found = in_a_fork(run, seconds=600, log=folder / "logs" / "sound.txt")
+            failed = None if found and found["status"] == 0 else (found or {}).get("failed") or left[0]
+            passed = left[: left.index(failed)] if failed else left
+            sound |= {*passed}
             write(sorted(sound), place)
-        else:
-            yield test
+            if failed:
+                yield failed
+            left = left[len(passed) + 1 :]
 
 
 def main() -> int:
