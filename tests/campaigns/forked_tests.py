@@ -117,6 +117,8 @@ def _pytest(tree: Path, files: Iterable[str], plugins: list[object], *options: s
     os.environ["PYTHONPATH"] = str(tree)
     sys.path.insert(0, str(tree))
     sys.dont_write_bytecode = not bytecode
+    if not bytecode:
+        os.environ["PYTHONDONTWRITEBYTECODE"] = "1"  # of processes that tests start
     quietly = ("-n", "0", "-q", "--tb=short", "-W", "ignore::pytest.PytestAssertRewriteWarning")
     return int(pytest.main([*files, *quietly, *options], plugins=plugins))
 

@@ -22,7 +22,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
-from itertools import accumulate
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ import forked_tests
 import ledger
 from forked_tests import in_a_fork
 from ledger import Outcome
-from mutations import Mutant, mutants, statement
+from mutations import Mutant, is_python, mutants, statement
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("models", "samplers", "likelihood", "problems", "training")
@@ -44,7 +44,7 @@ MOST_SECONDS = 60
 """Of tests for one mutant; those of module level could be all."""
 PATIENCE = 5
 """Times the usual duration after which a mutant counts as killed by time."""
-START = 20
+START = 60
 """Seconds for imports and collection, beside the duration of the tests."""
 
 
@@ -171,15 +171,16 @@ def whole_map(folder: Path, tree: Path) -> Map:
 
 
 def sample(tree: Path, count: int) -> list[str]:
-    """The first so many of all mutants, shuffled."""
+    """The first so many of all mutants, shuffled, that are Python: some change the ``*`` of a signature."""
     package = tree / "memcomp_lightning"
-    every = [
-        f"{file.relative_to(package)}:{mutant.line}/{mutant.operator.partition('/')[2]}/{mutant.occurrence}"
-        for file in sources(tree)
-        for mutant in mutants(file.read_text(encoding="utf-8"))
-    ]
+    texts = {file: file.read_text(encoding="utf-8") for file in sources(tree)}
+    every = [(file, mutant) for file, text in texts.items() for mutant in mutants(text)]
     random.Random(SEED).shuffle(every)
-    return every[:count]
+    drawn = (pair for pair in every if is_python(pair[1].of(texts[pair[0]])))
+    return [
+        f"{file.relative_to(package)}:{mutant.line}/{mutant.operator.partition('/')[2]}/{mutant.occurrence}"
+        for file, mutant in islice(drawn, count)
+    ]
 
 
 @cache

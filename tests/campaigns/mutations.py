@@ -61,6 +61,15 @@ def mutants(source: str) -> Iterator[Mutant]:
                 occurrence += 1
 
 
+def is_python(source: str) -> bool:
+    """Whether a text can be read as a module."""
+    try:
+        ast.parse(source)
+    except SyntaxError:
+        return False
+    return True
+
+
 def left_out(source: str) -> Iterator[tuple[Place, Place]]:
     """Where a change cannot change behaviour: begin and end."""
     lines = source.encode().splitlines()

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "campaigns"))
 
 import forked_tests
 import mutants
-from mutations import Mutant
+from mutations import Mutant, is_python
 
 THING = """
 def larger(a: int | None, b: int) -> int:
@@ -100,3 +100,15 @@ def test_the_table_counts() -> None:
         "| problems | 1 | 0 | 0 | 1 | 0 | 0.0% |",
         "| all | 4 | 1 | 1 | 2 | 0 | 50.0% |",
     ]
+
+
+def test_the_sample_is_seeded_and_python(tmp_path: Path) -> None:
+    folder = tmp_path / "memcomp_lightning/models"
+    folder.mkdir(parents=True)
+    text = "def total(a, *, b):\n    return a + b\n"
+    (folder / "thing.py").write_text(text)
+    every = [*mutants.mutants(text)]
+    cases = mutants.sample(tmp_path, len(every))
+    assert cases[:5] == mutants.sample(tmp_path, 5)
+    assert 5 < len(cases) == sum(is_python(mutant.of(text)) for mutant in every) < len(every)
+    assert {case.rpartition("/")[0] for case in cases} >= {"models/thing.py:2/ReplaceBinaryOperator_Add_Sub"}
