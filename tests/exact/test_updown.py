@@ -260,6 +260,18 @@ def test_the_error_of_a_bound_is_its_spread_over_copies_of_a_row(n_draws):
     torch.testing.assert_close(said, spread, rtol=0.15, atol=0)
 
 
+def test_only_the_visible_units_are_means_on_the_way_down():
+    model = model_of(sizes=(3, 2, 2))
+    x = torch.ones(50, 2, dtype=torch.float64)
+    for visible in ("mean", "sample"):
+        v, *hidden = model.down(x, visible=visible, generator=rng.stream(0, "down"))
+        assert [((part == 0) | (part == 1)).all().item() for part in (v, *hidden)] == [
+            visible == "sample",
+            True,
+            True,
+        ]
+
+
 def test_three_layers_have_a_bound_below_the_likelihood():
     model = model_of(sizes=(3, 2, 2))
     v = torch.stack(states_of(N))

@@ -11,7 +11,7 @@ from memcomp_lightning.models import DBM, RBM, units
 from memcomp_lightning.models.bit_form import at_real_means
 from memcomp_lightning.samplers import BlockAnnealing, GroundState, ModeAssisted, ModeSchedule, one_hot
 from memcomp_lightning.samplers.ground_state import posed_as
-from memcomp_lightning.samplers.mode_assisted import mode_scale
+from memcomp_lightning.samplers.mode_assisted import _n_terms, mode_scale
 from memcomp_lightning.samplers.one_hot import bits_of
 from memcomp_lightning.solvers import (
     AlternatingDescent,
@@ -194,6 +194,12 @@ def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
     stream = rng.stream(0, "negative_phase")
     found = blocks.sample(model, blocks.init(model, 1, generator=stream), positive, generator=stream)
     torch.testing.assert_close(found.info["mode_scale"], expected.squeeze(), check_dtype=False)
+
+
+def test_terms_of_an_energy_are_counted_by_sites():
+    for machine in (MODELS["Potts machine"](), small_machine()):
+        assert _n_terms(machine) == 1 + 7 + 7 * 6 // 2 - 1  # one pair is not coupled
+    assert _n_terms(MODELS["Potts RBM of several sizes"]()) == 1 + 6 + 4 * 2
 
 
 def test_solvers_get_a_matrix_where_it_is_mostly_filled():
