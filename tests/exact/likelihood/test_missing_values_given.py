@@ -23,6 +23,7 @@ from memcomp_lightning.likelihood.missing import (
 from memcomp_lightning.likelihood.missing.base import SHARES, drawn, real_entries
 from memcomp_lightning.likelihood.missing.chains import COMPONENTS, _swept
 from memcomp_lightning.likelihood.missing.choice import missing_bits
+from memcomp_lightning.likelihood.missing.ladders import Ladders
 from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
 from memcomp_lightning.models import RBM, BoltzmannMachine
@@ -300,3 +301,11 @@ def test_components_are_spread_over_the_sweeps(every: int) -> None:
     )
     sums = _swept(ladders, every * COMPONENTS, torch.tensor([0]), rng.stream(0, "sweeps"))
     assert sums.components.flatten().tolist() == [*range(0, every * COMPONENTS, every)]
+
+
+def test_hidden_units_are_drawn_first() -> None:
+    """They follow the start of the visible ones, which holds what is observed."""
+    model = RBM(4, 3)
+    known = torch.ones(1, 4, dtype=torch.bool)
+    ladders = Ladders.begun(model, torch.zeros(1, 4), known, 2, rng.stream(0, "ladders"))
+    assert ladders.blocks[0].units.tolist() == [4, 5, 6]
