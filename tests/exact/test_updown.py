@@ -249,6 +249,29 @@ def test_every_draw_is_the_likelihood_where_recognition_is_right():
     assert bound.standard_error.max() < 1e-12
 
 
+@pytest.mark.parametrize("n_draws", [2, 16])
+def test_the_error_of_a_bound_is_its_spread_over_copies_of_a_row(n_draws):
+    model = model_of(sizes=(3, 2, 2))
+    rows = torch.stack(states_of(N)[:2]).repeat_interleave(2000, dim=0)
+    log_z = log_partition_function(model.top)
+    found = recognition_bound(model, rows, log_z, n_draws=n_draws, generator=rng.stream(0, "bound"))
+    spread = found.value.view(2, 2000).std(-1)
+    said = found.standard_error.view(2, 2000).square().mean(-1).sqrt()
+    torch.testing.assert_close(said, spread, rtol=0.15, atol=0)
+
+
+def test_only_the_visible_units_are_means_on_the_way_down():
+    model = model_of(sizes=(3, 2, 2))
+    x = torch.ones(50, 2, dtype=torch.float64)
+    for visible in ("mean", "sample"):
+        v, *hidden = model.down(x, visible=visible, generator=rng.stream(0, "down"))
+        assert [((part == 0) | (part == 1)).all().item() for part in (v, *hidden)] == [
+            visible == "sample",
+            True,
+            True,
+        ]
+
+
 def test_three_layers_have_a_bound_below_the_likelihood():
     model = model_of(sizes=(3, 2, 2))
     v = torch.stack(states_of(N))
@@ -377,7 +400,7 @@ def test_what_cannot_be_is_refused():
         UpDownStep().add_gradient(model, batch, StepState(), streams=streams())
     with pytest.raises(SettingError, match="sampler = 'PseudoLikelihood'"):
         UpDownStep(top=EnergyStep(sampler=PseudoLikelihood()))
-    with pytest.raises(SettingError, match="label"):
+    with pytest.raises(SettingError, match="label = 'a tensor' is not allowed: expected None"):
         model_of().samples(3, sweeps=1, label=torch.zeros(3, dtype=torch.long), generator=rng.stream(0, "x"))
     log_z = torch.tensor(0.0)
     with pytest.raises(SettingError, match="v in column"):

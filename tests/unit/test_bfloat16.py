@@ -48,6 +48,11 @@ def test_an_error_in_the_sweep_leaves_torch_as_it_was(able, monkeypatch):
     assert precision() == before
 
 
+def test_without_the_library_for_it_nothing_multiplies_so(monkeypatch):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    assert bfloat16.multiplies_in_bfloat16.__wrapped__() is False
+
+
 def test_it_says_of_the_data_what_its_sampler_says():
     assert InBfloat16(sampler=CD()).uses_data
     assert not InBfloat16(sampler=PCD()).uses_data

@@ -1,8 +1,12 @@
 """Settings out of range are refused at construction: name, value, what is allowed."""
 
 import dataclasses
+import importlib
+import inspect
 import math
+import pkgutil
 import re
+from collections.abc import Iterator
 
 import pytest
 
@@ -191,3 +195,36 @@ def test_settings_are_named_frozen_and_known(kind):
         kind(getattr(settings, first))
     with pytest.raises(TypeError, match="misspelt"):
         kind(misspelt=1)
+
+
+def dataclasses_of(package: str) -> Iterator[type]:
+    folder = importlib.import_module(f"memcomp_lightning.{package}")
+    for found in pkgutil.walk_packages(folder.__path__, f"{folder.__name__}."):
+        for _, kind in inspect.getmembers(importlib.import_module(found.name), inspect.isclass):
+            if (
+                kind.__module__ == found.name
+                and dataclasses.is_dataclass(kind)
+                and not kind.__name__.startswith("_")
+            ):
+                yield kind
+
+
+@pytest.mark.parametrize("package", ["models", "samplers", "likelihood", "problems", "training"])
+def test_nothing_changes_after_it_was_checked(package: str) -> None:
+    thawed = [kind for kind in dataclasses_of(package) if not kind.__dataclass_params__.frozen]
+    assert thawed == []
+
+
+@pytest.mark.parametrize("package", ["samplers", "likelihood"])
+def test_settings_are_given_by_name(package: str) -> None:
+    fields = {
+        (kind, field.name): field.kw_only for kind in dataclasses_of(package) for field in dataclasses.fields(kind)
+    }
+    assert all(fields.values()), fields
+
+
+@pytest.mark.parametrize("kind", [k for k in dataclasses_of("problems") if k.__name__ != "Bipartite"])
+def test_problems_are_compared_as_objects(kind: type) -> None:
+    """Arrays have no one answer to whether they are equal."""
+    assert kind.__eq__ is object.__eq__
+    assert kind.__hash__ is object.__hash__

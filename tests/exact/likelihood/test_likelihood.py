@@ -108,6 +108,13 @@ def test_kernel_and_reference_agree_on_every_prefix(sizes, std):
         assert_same(ours, true)
 
 
+def test_the_kernel_does_not_mind_what_numpy_raises():
+    layers = layers_of(small_rbm(11, 13, std=250.0))
+    usual = prefix_log_weights(layers, n_second=3, compiled=True)
+    with np.errstate(all="raise"):
+        assert_same(prefix_log_weights(layers, n_second=3, compiled=True), usual)
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("block", [1, 7, 13, 10_000])
 def test_blocks_need_not_divide_the_states(block, compiled):

@@ -1,10 +1,14 @@
 """Missing values given the observed ones, of models of all kinds of units, against sums over all states."""
 
+import itertools
+import weakref
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from memcomp_lightning import rng
 from memcomp_lightning.likelihood.missing import (
@@ -16,11 +20,13 @@ from memcomp_lightning.likelihood.missing import (
     finders,
     of_observed,
 )
-from memcomp_lightning.likelihood.missing.base import SHARES, real_entries
+from memcomp_lightning.likelihood.missing.base import SHARES, drawn, real_entries
+from memcomp_lightning.likelihood.missing.chains import COMPONENTS, _swept
 from memcomp_lightning.likelihood.missing.choice import missing_bits
+from memcomp_lightning.likelihood.missing.ladders import Ladders
 from memcomp_lightning.likelihood.missing.states import patterns
 from memcomp_lightning.likelihood.values import has_free_energy
-from memcomp_lightning.models import BoltzmannMachine
+from memcomp_lightning.models import RBM, BoltzmannMachine
 from memcomp_lightning.models.observed import visible_units_coupled
 from memcomp_lightning.models.units import Bernoulli, Categorical, Gaussian, Mixed, Spin
 from memcomp_lightning.testing import brute_force, enumerated, small_machines, small_rbm, small_rbms
@@ -225,3 +231,81 @@ def test_a_potts_model_tells_rows_with_few_gaps_and_has_no_number_for_those_with
     observed[1] = False  # 12 bits
     found = of_observed(machine, v, observed, generator=rng.stream(0, "gaps"))
     assert found.log_weight.isnan().tolist() == [False, True, False]
+
+
+class Held(TorchDispatchMode):
+    """The most numbers that tensors made within hold at a time, in float64's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now, self.most = 0.0, 0.0
+        self.known: set[int] = set()
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = function(*args, **(kwargs or {}))
+        for tensor in made if isinstance(made, list | tuple) else [made]:
+            if isinstance(tensor, Tensor) and (storage := tensor.untyped_storage())._cdata not in self.known:
+                self.known.add(storage._cdata)
+                self.now += storage.nbytes() / 8
+                self.most = max(self.most, self.now)
+                weakref.finalize(storage, self._gone, storage._cdata, storage.nbytes() / 8)
+        return made
+
+    def _gone(self, key: int, numbers: float) -> None:
+        self.known.discard(key)
+        self.now -= numbers
+
+
+@pytest.mark.parametrize("m", [0, 10, 40])
+@pytest.mark.parametrize(
+    ("way", "model"),
+    [
+        (HiddenSums(), RBM(20, 6)),
+        (HiddenSums(), RBM(40, 2)),
+        (MissingSums(), RBM(20, 6)),
+        (MissingChains(n_chains=8, n_sweeps=4, most_sweeps=4), RBM(20, 6)),
+        (MissingChains(n_chains=8, n_sweeps=4, most_sweeps=4), RBM(visible=Gaussian(20), hidden=Bernoulli(6))),
+    ],
+    ids=["sums over 6 hidden", "sums over 2 hidden", "sums over missing", "chains", "chains of real values"],
+)
+def test_rows_take_about_the_memory_that_is_said(way: Any, model: Any, m: int) -> None:
+    observed = torch.ones(300, model.n_visible, dtype=torch.bool)
+    observed[:, :3] = False
+    most = []
+    for n in (100, 300):
+        v = model.visible.sample(torch.zeros(n, model.n_visible), generator=rng.stream(0, "rows"))
+        with Held() as held:
+            find(way, model, v, observed[:n], m)
+        most.append(held.most)
+    a_row = (most[1] - most[0]) / 200
+    assert way.numbers_a_row(model, m) / 8 < a_row < 4 * way.numbers_a_row(model, m)
+
+
+def test_a_number_that_rounding_makes_the_whole_sum_draws_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rng, "uniform", lambda size, **_: torch.ones(size))
+    assert (
+        drawn(torch.tensor([[0.25, 0.75], [1.0, 0.0]]), 3, generator=rng.stream(0, "draws")).tolist()
+        == [[1, 1]] * 3
+    )
+
+
+@pytest.mark.parametrize("every", [1, 3, 4])
+def test_components_are_spread_over_the_sweeps(every: int) -> None:
+    number = itertools.count()
+    ladders: Any = SimpleNamespace(
+        model=SimpleNamespace(n_visible=1),
+        n=1,
+        n_chains=1,
+        x=torch.zeros(1, 1),
+        sweep=lambda *_, **__: torch.tensor([[next(number)]]),
+    )
+    sums = _swept(ladders, every * COMPONENTS, torch.tensor([0]), rng.stream(0, "sweeps"))
+    assert sums.components.flatten().tolist() == [*range(0, every * COMPONENTS, every)]
+
+
+def test_hidden_units_are_drawn_first() -> None:
+    """They follow the start of the visible ones, which holds what is observed."""
+    model = RBM(4, 3)
+    known = torch.ones(1, 4, dtype=torch.bool)
+    ladders = Ladders.begun(model, torch.zeros(1, 4), known, 2, rng.stream(0, "ladders"))
+    assert ladders.blocks[0].units.tolist() == [4, 5, 6]

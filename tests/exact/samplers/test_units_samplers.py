@@ -1,15 +1,17 @@
 """Ground states of models of all units, by each solver and by annealing in blocks, against enumeration."""
 
 from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
 
 from memcomp_lightning import rng
-from memcomp_lightning.models import units
+from memcomp_lightning.models import DBM, RBM, units
 from memcomp_lightning.models.bit_form import at_real_means
 from memcomp_lightning.samplers import BlockAnnealing, GroundState, ModeAssisted, ModeSchedule, one_hot
-from memcomp_lightning.samplers.mode_assisted import mode_scale
+from memcomp_lightning.samplers.ground_state import posed_as
+from memcomp_lightning.samplers.mode_assisted import _n_terms, mode_scale
 from memcomp_lightning.samplers.one_hot import bits_of
 from memcomp_lightning.solvers import (
     AlternatingDescent,
@@ -17,6 +19,8 @@ from memcomp_lightning.solvers import (
     CrossoverAnnealing,
     GibbsAnnealing,
     Portfolio,
+    QuboSolution,
+    Status,
     TabuSearch,
 )
 from memcomp_lightning.solvers.dmm import DmmSolver
@@ -190,3 +194,54 @@ def test_the_scale_of_the_mode_is_that_at_the_means_of_real_units():
     stream = rng.stream(0, "negative_phase")
     found = blocks.sample(model, blocks.init(model, 1, generator=stream), positive, generator=stream)
     torch.testing.assert_close(found.info["mode_scale"], expected.squeeze(), check_dtype=False)
+
+
+def test_terms_of_an_energy_are_counted_by_sites():
+    for machine in (MODELS["Potts machine"](), small_machine()):
+        assert _n_terms(machine) == 1 + 7 + 7 * 6 // 2 - 1  # one pair is not coupled
+    assert _n_terms(MODELS["Potts RBM of several sizes"]()) == 1 + 6 + 4 * 2
+
+
+def test_solvers_get_a_matrix_where_it_is_mostly_filled():
+    dense = small_dbm()
+    posed, order = posed_as(dense)
+    assert isinstance(posed, RBM)
+    x = rng.bernoulli(torch.full((5, dense.n_units), 0.5), generator=rng.stream(0, "states"))
+    of_posed = posed.energy(*x.split((posed.n_visible, posed.n_hidden), dim=-1))
+    of_dense = dense.energy(*x[:, order].split((dense.n_visible, dense.n_hidden), dim=-1))
+    torch.testing.assert_close(of_posed - of_posed[0], of_dense - of_dense[0])
+    for sparse in (DBM(2, [2] * 7), small_machine(), small_rbm()):  # 28 of 64 couplings; no two classes; a matrix
+        assert posed_as(sparse) == (sparse, None)
+
+
+def test_a_proof_of_a_state_in_groups_stays_one():
+    model = MODELS["Potts RBM"]()
+    answers = one_hot.minimise_in_groups(model, model.in_bits(), BruteForce(), generator=rng.stream(0, "solver"))
+    assert (answers.solution.status == int(Status.OPTIMAL)).all()
+    assert answers.info["feasible_sites"] == 1
+
+
+def test_groups_that_an_answer_breaks_are_counted():
+    class FirstGroup:
+        """Has one bit in the first group, and none in the others."""
+
+        def minimise(self, qubo, *, generator):
+            state = torch.zeros(1, qubo.n)
+            state[0, 0] = 1
+            number = torch.zeros(1, dtype=torch.long)
+            return QuboSolution(state, qubo.energy(state), number + int(Status.CONVERGED), number, 0.0)
+
+    model = MODELS["Potts RBM"]()
+    answers = one_hot.minimise_in_groups(model, model.in_bits(), FirstGroup(), generator=rng.stream(0, "solver"))
+    torch.testing.assert_close(answers.info["feasible_sites"], torch.tensor(1 / 3))
+    assert (answers.solution.status == int(Status.CONVERGED)).all()
+
+
+@pytest.mark.parametrize("n_sweeps", [1, 2, 3, 4, 50])
+def test_sweeps_get_colder_by_one_factor_from_first_to_last(n_sweeps):
+    betas = BlockAnnealing(n_sweeps=n_sweeps, beta_first=0.2, beta_last=5.0).betas()
+    assert len(betas) == n_sweeps
+    assert betas[0] == pytest.approx(0.2)
+    if n_sweeps > 1:
+        assert betas[-1] == pytest.approx(5.0)
+        assert [b / a for a, b in pairwise(betas)] == pytest.approx([25 ** (1 / (n_sweeps - 1))] * (n_sweeps - 1))

@@ -93,6 +93,7 @@ def test_gaps_follow_the_rate_of_exchange():
     assert (found.info["swap_rate_lowest"] > 0.6).all()
     assert betas(found.state.gap).shape == (2, 5)
     assert (betas(found.state.gap).diff() < 0).all()
+    assert found.info["beta_hottest"].equal(betas(found.state.gap).amin(-1))
 
 
 def test_an_easy_model_is_tempered_to_infinite_temperature_and_no_further():

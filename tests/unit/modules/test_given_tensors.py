@@ -102,7 +102,17 @@ def test_values_that_the_units_do_not_take_are_refused():
 def test_other_columns_are_refused():
     with pytest.raises(SettingError, match="columns of a batch = 5 is not allowed: expected 6, the visible units"):
         [*pretrain(Greedy(RBM(6, 3)), V[:, :5], CD(k=1), iterations=1, optimizer=sgd)]
+    with pytest.raises(
+        SettingError, match="columns of a batch = 12 is not allowed: expected 6, the visible units"
+    ):
+        [*updates_of(torch.cat([V, V], dim=-1), RBM(6, 3).visible)]
     assert len([*updates_of(V)]) == 1
+
+
+def test_each_row_of_each_replica_has_a_label() -> None:
+    batch = as_batch(V.unflatten(0, (2, 3, 4)))
+    assert batch.label.shape == (2, 3, 4)
+    assert (batch.label == -1).all()
 
 
 def test_an_infinite_value_is_refused_beside_a_missing_one() -> None:

@@ -410,6 +410,17 @@ def test_packed_files_have_the_name_and_energies_of_the_others(write, name, text
         assert read_problem(write(name, compress(text.encode()))).format == plain.format, "told by its first bytes"
 
 
+@pytest.mark.parametrize(("number", "unit"), [("3", 1.0), ("0.5", 0.1), ("-1.250", 0.01)])
+def test_sums_are_multiples_of_the_last_digit(write, number, unit):
+    assert read_problem(write("a.gset", f"2 1\n1 2 {number}\n"), "gset").objective.counting.unit == unit
+
+
+def test_a_small_packed_file_may_be_thousands_of_times_as_large(write):
+    packed = lzma.compress(b"p cnf 1 1\n1 0\n" + b" " * 2**21)
+    assert 2000 * len(packed) < 2**21
+    assert read_problem(write("a.cnf.xz", packed)).n == 1
+
+
 def test_a_packed_file_may_not_fill_the_memory(write, monkeypatch):
     monkeypatch.setattr("memcomp_lightning.problems.files.source.MOST_UNPACKED", 1000)
     assert read_problem(write("a.cnf.xz", lzma.compress(b"p cnf 1 1\n1 0\n" + b" " * 900))).n == 1
