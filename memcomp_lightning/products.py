@@ -1,12 +1,12 @@
 """Which of torch's libraries multiplies matrices of float32 on a processor, and how it rounds."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 
 import torch
 from llvmlite.binding import get_host_cpu_name
-from torch import Tensor
+from torch import nn
 
 WORTH_ONEDNN = 2**22
 """Multiplications in a product of matrices, about, from which oneDNN's longer way to begin no longer counts."""
@@ -15,15 +15,19 @@ _TRIED = 256
 """Rows and columns; torch may leave small products as they are."""
 
 
-def quick_products(weights: Iterable[Tensor], n_rows: int) -> AbstractContextManager[None]:
-    """Multiply so many rows by weights, the parameters of a model, in the quickest way that rounds to float32.
+def quick_products(n: int) -> AbstractContextManager[None]:
+    """Make products of matrices, each of about ``n`` multiplications, in the quickest way that rounds to float32.
 
     On AMD's processors with AVX-512, MKL uses half of the width of their registers, and oneDNN takes half of its
     time. Sums are in float32 in both; their order is not the same, nor are the last bits. Elsewhere, and where a
     product has fewer than 2^22 multiplications, nothing changes.
     """
-    n = n_rows * max((weight.shape[-2:].numel() for weight in weights if weight.ndim > 1), default=0)
     return by_onednn() if n >= WORTH_ONEDNN and _onednn_is_quicker() else nullcontext()
+
+
+def n_weights(network: nn.Module) -> int:
+    """The weights of the largest layer of a network: multiplications of a row, but for replicas."""
+    return max((weight.shape[-2:].numel() for weight in network.parameters() if weight.ndim > 1), default=0)
 
 
 @contextmanager

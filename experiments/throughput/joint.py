@@ -85,7 +85,7 @@ class ByHand:
 
     @torch.no_grad()
     def run_pass(self, images: Tensor) -> None:
-        with quick_products([self.w1], BATCH):  # as ours
+        with quick_products(BATCH * SIZES[0] * sum(SIZES[1:])):  # as ours
             self._run_pass(images)
 
     def _run_pass(self, images: Tensor) -> None:

@@ -163,7 +163,7 @@ def theirs(units: Units, n_hidden: int, sampler: str, v: Tensor, draw: Draw) -> 
     chains = None if begin is None else units.sample(begin, generator=generator)
 
     def run() -> None:
-        with quick_products([model.weight], BATCH):  # as ours
+        with quick_products(BATCH * model.weight.numel()):  # as ours
             by_hand(batches_of(v), model, visible, chains=chains, precision=real, generator=generator)
 
     return timed(run), model

@@ -210,7 +210,7 @@ def _anneal(
     log_w = torch.zeros(v.shape[:-1], dtype=torch.float64, device=v.device)
     bias_gain = (model.b - base).unsqueeze(-1)
     base = base.unsqueeze(-2)
-    with quick_products(model.parameters(), v.shape[-2]):
+    with quick_products(v.shape[-2] * model.n_visible * model.n_hidden):
         field = model.hidden_field(v)
         for beta, target in tqdm(list(pairwise(betas)), desc="annealing", disable=not progress):
             log_w += (target - beta) * (v @ bias_gain).squeeze(-1).double()

@@ -9,7 +9,7 @@ from memcomp_lightning import defaults
 from memcomp_lightning.ambient import plain, with_gradient
 from memcomp_lightning.errors import require_choice, require_count
 from memcomp_lightning.modules.stage import StageModule
-from memcomp_lightning.products import quick_products
+from memcomp_lightning.products import n_weights, quick_products
 from memcomp_lightning.training import (
     FINETUNING_SGD,
     LOSSES,
@@ -89,7 +89,7 @@ class Classifier(StageModule):
         if self.filling is not None:
             batch = self.filling.complete(batch, self.streams["missing"])
         dropout = Dropout(self.dropout, [self.streams["dropout"]]) if self.dropout else None
-        with quick_products(network.parameters(), batch.v.shape[-2]):
+        with quick_products(batch.v.shape[-2] * n_weights(network)):
             loss, losses, logits = ClassifierStep(network, self.loss, dropout).loss(batch)
             self.update(loss, closes_step=batch.closes_step)
         return {"loss": loss.detach(), "score": score_of(losses, logits, batch.label)}

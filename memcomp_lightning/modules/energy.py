@@ -301,7 +301,7 @@ class EnergyPretraining(StageModule):
     def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the gradient of the contrast of both phases; return it, and what the callbacks look at."""
         batch, phase = as_batch(batch, self._units), self.phases[self.layer]
-        with quick_products(phase.model.parameters(), batch.v.shape[-2]):
+        with quick_products(batch.v.shape[-2] * phase.model.n_visible * phase.model.n_hidden):
             return self._train_on(batch, phase)
 
     def _train_on(self, batch: Batch, phase: Phase) -> dict[str, object]:

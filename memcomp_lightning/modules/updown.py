@@ -14,7 +14,7 @@ from memcomp_lightning.errors import require, require_count
 from memcomp_lightning.models import GenerativeDBN
 from memcomp_lightning.modules.stage import StageModule
 from memcomp_lightning.objective import Offsets
-from memcomp_lightning.products import quick_products
+from memcomp_lightning.products import n_weights, quick_products
 from memcomp_lightning.samplers import tensors_of, with_tensors
 from memcomp_lightning.training import PRETRAINING_SGD, OptimizerFactory, Schedule, StepState, UpDownStep
 from memcomp_lightning.training.given import Given, as_batch
@@ -68,7 +68,7 @@ class UpDown(StageModule):
     def training_step(self, batch: Given, batch_idx: int) -> dict[str, object]:
         """Follow the three gradients; return the losses."""
         batch = as_batch(batch)
-        with quick_products(self.network.parameters(), batch.v.shape[-2]):
+        with quick_products(batch.v.shape[-2] * n_weights(self.network)):
             losses, self._state = self.step.add_gradient(self.network, batch, self._state, streams=self.streams)
         loss = torch.stack(losses).sum().detach()
         self.update(loss, closes_step=batch.closes_step)

@@ -16,7 +16,7 @@ from memcomp_lightning import rng
 from memcomp_lightning.ambient import with_gradient
 from memcomp_lightning.errors import require_count
 from memcomp_lightning.objective import Centring, weighted
-from memcomp_lightning.products import quick_products
+from memcomp_lightning.products import n_weights, quick_products
 from memcomp_lightning.samplers.base import holds_chains, positive_phase
 from memcomp_lightning.training.backprop import ClassifierStep
 from memcomp_lightning.training.best import JUDGED_BY, BestPass
@@ -165,7 +165,7 @@ class PhaseTraining:
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         state, phase = self._state, self.phase
         for batch in updates_of(batches, self._units):
-            with quick_products(phase.model.parameters(), batch.v.shape[-2]):
+            with quick_products(batch.v.shape[-2] * phase.model.n_visible * phase.model.n_hidden):
                 with torch.no_grad():
                     _, found = phase.positive_of(batch, self.streams["positive_phase"])
                     positive = weighted(found.configurations, batch.weight)
@@ -218,7 +218,7 @@ class ClassifierTraining:
         begin_pass(self.schedules, self.optimizer, self.passes_done)
         step = ClassifierStep(self.network, self.loss, self.dropout)
         for batch in updates_of(batches):
-            with quick_products(self.network.parameters(), batch.v.shape[-2]):
+            with quick_products(batch.v.shape[-2] * n_weights(self.network)):
                 step.add_gradient(batch)
             if batch.closes_step:
                 self.optimizer.step()

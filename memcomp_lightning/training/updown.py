@@ -19,7 +19,7 @@ from memcomp_lightning.models.base import Readout
 from memcomp_lightning.models.conditional import Conditional
 from memcomp_lightning.models.generative import GenerativeDBN
 from memcomp_lightning.objective import shares, weighted
-from memcomp_lightning.products import quick_products
+from memcomp_lightning.products import n_weights, quick_products
 from memcomp_lightning.samplers import CD, positive_phase
 from memcomp_lightning.training.diverged import require_finite
 from memcomp_lightning.training.given import Given, begin_epoch, updates_of
@@ -158,7 +158,7 @@ def up_down(
         n_updates = 0
         with with_gradient():
             for batch in updates_of(batches, model.visible):
-                with quick_products(model.parameters(), batch.v.shape[-2]):
+                with quick_products(batch.v.shape[-2] * n_weights(model)):
                     losses, state = step.add_gradient(model, batch, state, streams=streams)
                 found.append(torch.stack(losses) * batch.share)
                 if batch.closes_step:

@@ -14,10 +14,8 @@ from memcomp_lightning.likelihood import Ais
 from memcomp_lightning.models import DBN, RBM
 from memcomp_lightning.products import quick_products
 from memcomp_lightning.samplers import CD
-from memcomp_lightning.training import ClassifierTraining, Greedy, pretrain
+from memcomp_lightning.training import ClassifierTraining, Greedy, Joint, pretrain
 
-LARGE = [torch.empty(512), torch.empty(512, 1024)]
-ROWS = products.WORTH_ONEDNN // (512 * 1024)
 SGD = partial(torch.optim.SGD, lr=0.1)
 
 
@@ -36,12 +34,11 @@ def quicker(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quicker")
 def test_large_products_are_oneDNNs_and_small_ones_stay() -> None:  # noqa: N802
     before = precision()
-    with quick_products(LARGE, ROWS):
+    with quick_products(2**22):
         assert precision() == "bf16"
-    for weights, n_rows in ((LARGE, ROWS - 1), ([torch.empty(2**24)], 8), ([], 8)):
-        with quick_products(weights, n_rows):
-            assert precision() == before
-    with pytest.raises(ZeroDivisionError), quick_products(LARGE, ROWS):
+    with quick_products(2**22 - 1):
+        assert precision() == before
+    with pytest.raises(ZeroDivisionError), quick_products(2**22):
         _ = 1 / 0
     assert precision() == before
 
@@ -79,20 +76,26 @@ def test_what_is_quicker_here_rounds_no_more_than_before(shape: tuple[int, int, 
     x, w = (rng.uniform(size, generator=generator) - 0.5 for size in ((n, k), (m, k)))
     exact = x.double() @ w.double().T
     found = []
-    for n_rows in (0, 2**30):
-        with quick_products([w], n_rows):
+    for n_multiplications in (0, 2**30):
+        with quick_products(n_multiplications):
             found += [torch.nn.functional.linear(x, w), torch.bmm(x[None], w.T[None])[0]]
     errors = [float((product - exact).abs().max()) for product in found]
     assert max(errors[2:]) < 2 * max(errors[:2]) + 1e-6
 
 
-@pytest.mark.parametrize("training", ["pretraining", "fine-tuning", "likelihood"])
+def test_the_largest_layer_counts_for_each_replica() -> None:
+    network = torch.nn.ParameterList([torch.empty(2**20), torch.empty(7, 5, 3), torch.empty(4, 2)])
+    assert products.n_weights(network) == 15
+    assert products.n_weights(torch.nn.Identity()) == 0
+
+
+@pytest.mark.parametrize("training", ["pretraining", "pretraining of a machine", "fine-tuning", "likelihood"])
 def test_updates_and_annealing_take_it(monkeypatch: pytest.MonkeyPatch, training: str) -> None:
     asked = []
 
     @contextmanager
-    def watched(weights: Iterator[torch.Tensor], n_rows: int) -> Iterator[None]:
-        asked.append((max(weight.numel() for weight in weights), n_rows))
+    def watched(n: int) -> Iterator[None]:
+        asked.append(n)
         yield
 
     for module in ("training.loops", "likelihood.ais"):
@@ -101,10 +104,12 @@ def test_updates_and_annealing_take_it(monkeypatch: pytest.MonkeyPatch, training
     batches = Batches(v, label, 4, 6, True, 0)
     if training == "pretraining":
         list(pretrain(Greedy(DBN(5, [3])), batches, CD(), iterations=1, optimizer=SGD))
+    elif training == "pretraining of a machine":  # whose couplings are a list
+        list(pretrain(Joint(DBN(5, [2, 1])), batches, CD(), iterations=1, optimizer=SGD))
     elif training == "fine-tuning":
         network = torch.nn.utils.skip_init(torch.nn.Linear, 5, 3)
         ClassifierTraining(network, optimizer=SGD).run_pass(batches)
     else:
         Ais(n_chains=4, n_betas=2).estimate(RBM(5, 3), generator=rng.stream(0, "AIS"))
     assert asked
-    assert asked[0] == (15, 4)
+    assert asked[0] == 4 * 5 * 3

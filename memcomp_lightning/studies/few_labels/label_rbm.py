@@ -14,7 +14,7 @@ from memcomp_lightning.models import RBM, Normal
 from memcomp_lightning.models.affine import affine
 from memcomp_lightning.models.units import Bernoulli, Categorical, Mixed
 from memcomp_lightning.objective import Centring
-from memcomp_lightning.products import quick_products
+from memcomp_lightning.products import n_weights, quick_products
 from memcomp_lightning.samplers import CD
 from memcomp_lightning.studies.few_labels.data import Sets
 from memcomp_lightning.studies.few_labels.learner import Context, Point, point_of
@@ -95,7 +95,7 @@ class LabelRbm:
         batches, state, generator = sets.batches(size), StepState(), rng.stream(sets.seed, "label RBM")
         for number in range(n_passes):
             begin_epoch(batches, number)
-            with with_gradient(), quick_products(network.parameters(), size):
+            with with_gradient(), quick_products(size * n_weights(network)):
                 for batch in batches:
                     if self.discriminative:
                         by_class.add_gradient(batch)
