@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from statistics import median
 from typing import Any, NamedTuple
@@ -154,8 +155,10 @@ def ours(units: Units, n_hidden: int, sampler: str, v: Tensor) -> tuple[Seconds,
     return timed(lambda: [*training] and None), dbn
 
 
-def theirs(units: Units, n_hidden: int, sampler: str, v: Tensor, draw: Draw) -> tuple[Seconds, Parameters]:
-    """Seconds of an epoch of the loop by hand, and what it trained."""
+def theirs(
+    units: Units, n_hidden: int, sampler: str, v: Tensor, draw: Draw, *, same_products: bool = False
+) -> tuple[Seconds, Parameters]:
+    """Seconds of an epoch of the loop by hand, and what it trained; as torch multiplies, or as ours does."""
     model, real = Parameters(units, n_hidden), isinstance(units, Gaussian)
     visible = gaussian_draw if real else categorical_draw(units.n // units.n_sites, draw)
     generator = rng.stream(0, "negative_phase")
@@ -163,7 +166,7 @@ def theirs(units: Units, n_hidden: int, sampler: str, v: Tensor, draw: Draw) -> 
     chains = None if begin is None else units.sample(begin, generator=generator)
 
     def run() -> None:
-        with quick_products(BATCH * model.weight.numel()):  # as ours
+        with quick_products(BATCH * model.weight.numel()) if same_products else nullcontext():
             by_hand(batches_of(v), model, visible, chains=chains, precision=real, generator=generator)
 
     return timed(run), model
@@ -174,6 +177,9 @@ def case(units: Units, n_hidden: int, sampler: str, v: Tensor, repeats: int) -> 
     runs: dict[str, Callable[[], Seconds]] = {"ours": lambda: ours(units, n_hidden, sampler, v)[0]}
     for label in ["inversion"] if isinstance(units, Gaussian) else DRAWS:
         runs[label] = partial(lambda draw: theirs(units, n_hidden, sampler, v, draw)[0], DRAWS[label])
+    draw = DRAWS["inversion" if isinstance(units, Gaussian) else "search"]
+    same = partial(theirs, units, n_hidden, sampler, v, draw, same_products=True)
+    runs["same products"] = lambda: same()[0]
     for run in runs.values():  # warms up
         run()
     seconds = {label: list[Seconds]() for label in runs}
@@ -181,12 +187,15 @@ def case(units: Units, n_hidden: int, sampler: str, v: Tensor, repeats: int) -> 
         for label, run in runs.items():
             seconds[label].append(run())
     wall, cpu = ({label: [x[k] for x in spent] for label, spent in seconds.items()} for k in (0, 1))
-    best = min((label for label in runs if label != "ours"), key=lambda label: median(cpu[label]))
+    others = [label for label in runs if label not in ("ours", "same products")]
+    best = min(others, key=lambda label: median(cpu[label]))
     ratios = [a / b for a, b in zip(wall["ours"], wall[best], strict=True)]
     row: dict[str, Any] = {"ours_s": median(wall["ours"]), "by_hand_s": median(wall[best])}
     row |= {"ratio": median(ratios), "ratio_least": min(ratios), "ratio_most": max(ratios)}
     row |= {"cpu_ratio": median(a / b for a, b in zip(cpu["ours"], cpu[best], strict=True))}
     row["draws_by_hand"] = "" if isinstance(units, Gaussian) else best
+    both = zip(cpu["ours"], cpu.pop("same products"), strict=True)
+    row["cpu_ratio_same_products"] = median(a / b for a, b in both)
     return row | {f"{label}_cpu_s": median(spent) for label, spent in cpu.items()}
 
 
