@@ -262,8 +262,10 @@ class Batches:
             return Batch(v, label, chunk.share, chunk.closes_step, None, observed)
         weight, share = self._weights(positions, order), 1.0
         if positions != chunk.step or self._of_steps:  # a device would be waited for; alike for all seeds
-            of_own = float(self._weights(chunk.step, order).sum())
-            of_step = self._of_steps[chunk.number] if self._of_steps else of_own
+            if self._of_steps:
+                of_step = self._of_steps[chunk.number]
+            else:
+                of_step = float(self._weights(chunk.step, order).sum())
             share = self._world_size * float(weight.sum()) / of_step
         return Batch(v, label, share, chunk.closes_step, weight, observed)
 
