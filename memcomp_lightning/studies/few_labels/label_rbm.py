@@ -90,7 +90,8 @@ class LabelRbm:
     def _passes(
         self, network: FreeEnergyClassifier, sets: Sets, rate: float, generative: float, size: int, n_passes: int
     ) -> Iterator[int]:
-        optimizer = torch.optim.SGD(network.rbm.parameters(), lr=rate, momentum=FINETUNING_MOMENTUM)
+        weights = network.rbm.parameters()
+        optimizer = torch.optim.SGD(weights, lr=rate, momentum=FINETUNING_MOMENTUM, fused=True)
         energy, by_class = EnergyStep(sampler=CD(), centring=Centring(rate=0.01)), ClassifierStep(network)
         batches, state, generator = sets.batches(size), StepState(), rng.stream(sets.seed, "label RBM")
         for number in range(n_passes):

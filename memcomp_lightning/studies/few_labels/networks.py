@@ -103,6 +103,7 @@ def trained(
         lr=setting["rate"],
         momentum=FINETUNING_MOMENTUM,
         weight_decay=setting.get("weight_decay", 0.0),
+        fused=True,  # few images an update: its step is as much work as its gradient
     )
     at, label = (sets.at, sets.label) if others is None else others
     passes = finetune(
