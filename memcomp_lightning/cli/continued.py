@@ -10,12 +10,14 @@ from hydra import compose
 from omegaconf import DictConfig
 
 from memcomp_lightning.cli.arguments import expanded, from_folder, parse, read, unquoted
-from memcomp_lightning.cli.overrides import check_is_folder, with_search_path
+from memcomp_lightning.cli.launched import launched
+from memcomp_lightning.cli.overrides import with_search_path
 from memcomp_lightning.configuration.composition import SEARCH_PATH, search_paths
 from memcomp_lightning.configuration.continued import finished
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS
 from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.runs.addresses import fetch, fetched, is_address, name_of
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.paths import is_path
 from memcomp_lightning.runs.trust import foreign, require_no_links
@@ -52,6 +54,7 @@ class Written:
             UserError: They set what Hydra does, or look for settings where nobody trusts them.
         """
         found = [from_folder(override, self.folder.typed_in) for override in self.folder.overrides or []]
+        found = [override for override in found if not self._copies(override)]
         if self.setting == "continue" and (choice := (self.folder.result or {}).get("choice")):
             if type(choice.get("value")) not in (int, float):
                 raise UserError(f"continue={self.folder.path}: result.json is damaged: its choice is no number.")
@@ -61,6 +64,21 @@ class Written:
             self._check_text(override)
         self._refuse({entry: f"{entry}, where settings would be looked for" for entry in self._places(found)})
         return found
+
+    def _copies(self, override: str) -> bool:
+        """Whether an override sends the run somewhere, which is for those who go on with it to say.
+
+        Raises:
+            UserError: They do not say whether it goes there.
+        """
+        name, _, address = override.partition("=")
+        if name == "copy_to" and self.setting == "resume" and "copy_to" not in map(_name, self.typed):
+            line = shlex.join(["memcomp-train", f"resume={self.folder.path}", override, *self.typed])
+            raise UserError(
+                f"resume={self.folder.path}: this run was copied to {address}. Copy it there again with {line}, "
+                "or type copy_to=null in its place."
+            )
+        return name in ("copy_to", "copy_every")
 
     def _check_text(self, override: str) -> None:
         """Raise a UserError for what could stand for anything, or lead Hydra elsewhere."""
@@ -161,7 +179,6 @@ def _named(setting: str, arguments: Sequence[str]) -> str | None:
         )
     if not names:
         return None
-    check_is_folder(setting, unquoted(names[-1]))
     return unquoted(names[-1])
 
 
@@ -172,7 +189,10 @@ def _resumed(name: str, arguments: Sequence[str], trusted: Collection[str]) -> t
             f"resume={name} goes on with one run, without -m; a sweep goes on when the same command is given with "
             "hydra.sweep.dir=FOLDER."
         )
-    folder = RunFolder(Path(expanded("resume", name)))
+    own = [] if not is_address(name) else _brought_here(name, arguments)
+    arguments = [*arguments, *(override for override in own if _name(override) not in map(_name, arguments))]
+    here = unquoted(own[0].partition("=")[2]) if own else expanded("resume", name)
+    folder = RunFolder(Path(here))
     if folder.overrides is None:
         raise UserError(
             f"resume={folder.path}: there is no overrides.json. Name the folder of a run of memcomp-train; a "
@@ -184,13 +204,34 @@ def _resumed(name: str, arguments: Sequence[str], trusted: Collection[str]) -> t
     return [*written.overrides(), *typed, with_path("hydra.run.dir", folder.path)], written
 
 
+def _brought_here(address: str, arguments: Sequence[str]) -> list[str]:
+    """Fetch a run from an address; return the overrides that say where it is now, and where it is copied to.
+
+    Raises:
+        UserError: Something is in the way, or several processes would fetch it.
+    """
+    if launched() is not None:
+        raise UserError(
+            f"resume={address}: several processes would fetch it. Fetch it to a disk that all of them see."
+        )
+    typed = [a.partition("=")[2] for a in arguments if a.startswith("hydra.run.dir=")]
+    folder = Path(unquoted(typed[-1])) if typed else Path("runs", name_of(address))
+    if folder.exists():
+        raise UserError(
+            f"resume={address}: {folder} is there already. Go on in it with resume={folder} copy_to={address}, or "
+            "fetch the run to another folder with hydra.run.dir=FOLDER."
+        )
+    fetch(address, folder)
+    return [with_path("hydra.run.dir", folder), f"copy_to={address}"]
+
+
 def _continued(name: str, arguments: Sequence[str], trusted: Collection[str]) -> tuple[list[str], Written]:
     """The settings of a finished run, and what is typed in place of some of them.
 
     What is typed takes the place of a setting of the run, another option of a group that of all settings in it.
     A setting that the run chose by held-out images keeps the value that was chosen.
     """
-    folder = finished(Path(expanded("continue", name)).absolute())
+    folder = finished(fetched(name) if is_address(name) else Path(expanded("continue", name)).absolute())
     typed = [argument for argument in arguments if not argument.startswith("continue=")]
     written = Written("continue", folder, typed, trusted)
     earlier = written.overrides()

@@ -34,6 +34,7 @@ from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS, check_e
 from memcomp_lightning.configuration.hydra_versions import register_resolver
 from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError, lost
+from memcomp_lightning.runs.addresses import is_address
 from memcomp_lightning.runs.paths import is_path
 
 LONGEST_NAME = 150
@@ -87,7 +88,7 @@ def check_command_line(
         overrides = with_search_path(overrides, line.config_dir)
     key = "hydra.sweep.dir" if line.multirun else "hydra.run.dir"
     if not line.shows:
-        check_is_folder(key, line.value(key))
+        _check_is_folder(key, line.value(key))
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
     folder: str | None = None
     root: Path | None = None
@@ -352,13 +353,12 @@ def with_search_path(overrides: Sequence[str], folder: Path | None) -> list[str]
     return [f"{SEARCH_PATH}{places}", *(o for o in overrides if o not in given)]
 
 
-def check_is_folder(name: str, value: str | None) -> None:
+def _check_is_folder(name: str, value: str | None) -> None:
     """Raise a UserError for the address of an object store, which would become a folder of that name."""
-    if value is not None and re.match(r"\w[\w+.-]*://", value):
-        remedy = f"mount the store, or train in a folder and copy it: {name}=runs/mine"
+    if value is not None and is_address(value):
         raise UserError(
             f"{name} = {value} is not allowed: expected a folder of a file system. A run renames and links files, "
-            f"which object stores cannot do: {remedy}"
+            f"which object stores cannot do. Let it be copied there: {name}=runs/mine copy_to={value}"
         )
 
 

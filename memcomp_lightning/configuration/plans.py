@@ -63,7 +63,7 @@ _OF_TRAINING = (
 )
 _STOPPING = ("keep_best", "best_by", "patience")
 _SETTINGS = {
-    "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "choose", "tried", *STUDIES),
+    "": (*_OF_MODELS, *_OF_TRAINING, "between_stages", "copy_to", "copy_every", "choose", "tried", *STUDIES),
     "data": ("source", *DEALT),
     "pretrain": (
         *_STAGE_SETTINGS,

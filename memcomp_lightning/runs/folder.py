@@ -281,7 +281,15 @@ _LARGEST_SETTINGS = 2**20
 """Bytes of a settings.yaml that is read."""
 
 _WORKERS = ("figure.workers", "worth.workers", "density.workers", "few_labels.workers")
-_FREE_TO_CHANGE = ("logger.", "checkpoint_every", "data.source.data_dir", "data.source.download", *_WORKERS)
+_FREE_TO_CHANGE = (
+    "logger.",
+    "checkpoint_every",
+    "copy_to",
+    "copy_every",
+    "data.source.data_dir",
+    "data.source.download",
+    *_WORKERS,
+)
 """Settings that do not change what is computed."""
 
 

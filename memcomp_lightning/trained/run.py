@@ -16,6 +16,7 @@ from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
 from memcomp_lightning.errors import Told, UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
+from memcomp_lightning.runs.addresses import fetched, is_address
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.trust import check_targets, forget_lost_initialisers, resolved
 from memcomp_lightning.trained.alone import network_of as network_alone
@@ -116,8 +117,9 @@ def load(
     taken, units that a file does not name, a run that has not finished.
 
     Args:
-        path: A run folder of ``memcomp-train``, a file of its folders ``weights`` and ``checkpoints``, such a file
-            moved elsewhere, or a ``.safetensors`` file of ``memcomp-export``.
+        path: A run folder of ``memcomp-train``, the address that it was copied to (``s3://bucket/run``), a file of
+            its folders ``weights`` and ``checkpoints``, such a file moved elsewhere, or a ``.safetensors`` file of
+            ``memcomp-export``.
         network: Takes the weights of a file that lies by itself: an RBM, a DBN, any module. DBNs, RBMs and
             classifiers of hidden units in {0, 1} follow from the tensors: leave it out.
         schema: What the visible units of a file that lies by itself stand for: a ``schema.json`` of the run
@@ -128,7 +130,7 @@ def load(
     Raises:
         UserError, CheckpointError: There is no finished training; the message says what is needed.
     """
-    path = Path(path)
+    path = fetched(str(path)) if is_address(str(path)) else Path(path)
     if path.is_dir():
         _require_no_schema(schema, "a run folder has its own")
         return _of_folder(path, replica, trusted)

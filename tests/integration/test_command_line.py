@@ -283,11 +283,12 @@ def test_a_missing_package_names_the_extra_to_install(memcomp_train: Run, monkey
 
 @pytest.mark.parametrize(
     "argument",
-    ["hydra.run.dir=s3://bucket/run", "hydra.run.dir=memory://run", "resume=gs://run", "continue=file:///run"],
+    ["hydra.run.dir=s3://bucket/run", "hydra.run.dir=memory://run"],
 )
 def test_addresses_of_object_stores_are_no_folders(memcomp_train: Run, argument: str) -> None:
     outcome = memcomp_train("sampler=cd", argument)
     name, _, value = argument.partition("=")
     assert outcome.status == 2
     assert f"{name} = {value} is not allowed: expected a folder of a file system." in outcome.err
+    assert f"{name}=runs/mine copy_to={value}" in outcome.err
     assert list(Path().iterdir()) == []

@@ -37,6 +37,7 @@ from memcomp_lightning.configuration.trainers import check_trainers, trainer_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
+from memcomp_lightning.runs.addresses import check_address, copied, is_address
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.history import history_with
 from memcomp_lightning.runs.lock import InUseError
@@ -68,7 +69,8 @@ def train(config: DictConfig) -> float | None:
     in_sweep = settings.mode == RunMode.MULTIRUN
     try:
         trains = _is_first_process() and folder.result is None
-        with folder.held() if trains else nullcontext():
+        address = _copy_to(config, folder if in_sweep else None) if _is_first_process() else None
+        with folder.held() if trains else nullcontext(), copied(folder.path, address, config.copy_every):
             return _train(config, folder, [*search_path(settings), *settings.overrides.task])
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
@@ -83,8 +85,18 @@ def train(config: DictConfig) -> float | None:
         return 0.0 if isinstance(error, DivergedError) else None
 
 
+def _copy_to(config: DictConfig, job: RunFolder | None) -> str | None:
+    """The address of the run, or of a job of a sweep, which has its folder's name there; None without."""
+    return config.copy_to if job is None or config.copy_to is None else f"{config.copy_to}/{job.path.name}"
+
+
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     """Build a job, and train nothing."""
+    if config.copy_to is not None:
+        of_store = is_address(str(config.copy_to))
+        require(of_store, "copy_to", config.copy_to, "an address, s3://bucket/run or file:///folder")
+        require(config.copy_every > 0, "copy_every", config.copy_every, "seconds > 0")
+        check_address(config.copy_to)
     if study_of(config) is not None:
         allowed = "null: figures and comparisons train new networks"
         require(config["continue"] is None, "continue", config["continue"], allowed)
@@ -187,13 +199,17 @@ def _open(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> No
         folder.open(config, overrides)
 
 
+def _copies(config: DictConfig) -> list[str]:
+    return [] if config.copy_to is None else [f"copy_to={config.copy_to}"]
+
+
 @contextmanager
 def _resumable(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> Iterator[None]:
     """Name the command that goes on where a run that has begun is ended from outside."""
 
     def command() -> str:
-        trusted = to_trust(config, overrides, folder.path)
-        return shlex.join([COMMAND, f"resume={short_path(folder.path)}", *trusted])
+        beside = [*to_trust(config, overrides, folder.path), *_copies(config)]
+        return shlex.join([COMMAND, f"resume={short_path(folder.path)}", *beside])
 
     try:
         with going_on(command, any_file=True):
