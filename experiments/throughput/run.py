@@ -25,8 +25,8 @@ from memcomp_lightning.callbacks import NegativePhaseEnergies, OptimizerMonitor,
 from memcomp_lightning.data import Batches, Digits, ImageData, ImageDataModule
 from memcomp_lightning.models import DBN
 from memcomp_lightning.modules import DBNClassifier, EnergyPretraining
-from memcomp_lightning.products import quick_products
-from memcomp_lightning.samplers import CD
+from memcomp_lightning.products import multiplies_in_bfloat16, quick_products
+from memcomp_lightning.samplers import CD, InBfloat16
 from memcomp_lightning.training import Greedy, pretrain
 from memcomp_lightning.training.given import Given
 
@@ -76,13 +76,13 @@ def lightning_epoch(
     return clock.spent, dbn[0].weight.detach()
 
 
-def bare_epoch(images: ImageData) -> Seconds:
+def bare_epoch(images: ImageData, sampler: CD | InBfloat16) -> Seconds:
     """The same updates by the package's loop without a trainer."""
     dbn = DBN(N_VISIBLE, [N_HIDDEN])
     batches = Batches(images.train_v, images.train_label, BATCH, len(images.train_v), True, 0)
     optimizer = partial(torch.optim.SGD, lr=LEARNING_RATE, momentum=MOMENTUM)
     begin = Seconds.now()
-    for _ in pretrain(Greedy(dbn), batches, CD(k=1), iterations=1, optimizer=optimizer):
+    for _ in pretrain(Greedy(dbn), batches, sampler, iterations=1, optimizer=optimizer):
         pass
     return Seconds.now().since(begin)
 
@@ -161,12 +161,15 @@ def main() -> None:
     candidates: dict[str, Callable[[], Seconds]] = {
         "EnergyPretraining, logging on": lambda: lightning_epoch(images)[0],
         "Lightning without work in its steps": lambda: lightning_epoch(images, OneStep)[0],
-        "training.pretrain, without a trainer": lambda: bare_epoch(images),
+        "training.pretrain, without a trainer": lambda: bare_epoch(images, CD(k=1)),
         "hand-written torch loop": lambda: hand_written_epoch(images)[0],
         "the same loop, products as ours": lambda: with_our_products(images)[0],
         "scikit-learn BernoulliRBM, float32": lambda: sklearn_epoch(images, "float32"),
         "scikit-learn BernoulliRBM, float64": lambda: sklearn_epoch(images, "float64"),
     }
+    if multiplies_in_bfloat16():
+        sampler = InBfloat16(sampler=CD(k=1))
+        candidates["the same, products=bf16"] = lambda: bare_epoch(images, sampler)
     difference = (lightning_epoch(images)[1] - with_our_products(images)[1]).abs().max()  # warms up, too
     seconds: dict[str, list[Seconds]] = {name: [] for name in candidates}
     for _ in range(arguments.repeats):

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from memcomp_lightning.errors import UserError
 from memcomp_lightning.files import inside, read_json, write_json
@@ -25,8 +25,11 @@ INDEX = ".copied.json"
 MOST_FILES = 100_000
 """Files that are fetched from one address: more than any run has."""
 
-_MARKS = ("stages.json", "result.json")
-"""Say that other files are whole, so that they are read before these and copied after them."""
+BEGUN = "overrides.json"
+"""Says that a folder is a run: it is the first file that is copied."""
+
+_STAGES, _RESULT = "stages.json", "result.json"
+"""They say that other files are whole: they are read before these are listed, and copied after them."""
 
 _VERSIONED_BY = (
     "size",
@@ -70,14 +73,19 @@ def cache() -> Path:
 def fetch(address: str, folder: Path) -> None:
     """Fetch a run into a folder, which must not be there; it appears when it is whole.
 
+    Relative paths in its settings are meant from the present folder from now on: that in which they were typed may
+    be on another machine.
+
     Raises:
         UserError: There is no run, or it cannot be read.
     """
-    _fetch(address, folder, _run_at(address))
+    _fetch(address, folder, _run_at(address), typed_in=Path.cwd())
 
 
 def fetched(address: str) -> Path:
     """A copy of a run to be read, in the user's cache; it is fetched where it is not there as it is now.
+
+    Relative paths in its settings are meant from the folder in which it is used.
 
     Raises:
         UserError: There is no run, or it cannot be read.
@@ -87,14 +95,17 @@ def fetched(address: str) -> Path:
     folder = cache() / version / name_of(address)
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with suppress(FileExistsError):  # another process was quicker
-            _fetch(address, folder, there)
+        try:
+            _fetch(address, folder, there, typed_in=None)
+        except OSError:
+            if not folder.is_dir():  # else another process was quicker
+                raise
     return folder
 
 
 def _run_at(address: str) -> dict[str, str]:
     there = _files(address)
-    if "overrides.json" not in there:
+    if BEGUN not in there:
         has = f"no overrides.json among its {len(there)} files" if there else "nothing"
         raise UserError(f"{address}: there is {has}. Name the address that a run of memcomp-train was copied to.")
     if len(there) > MOST_FILES:
@@ -102,7 +113,7 @@ def _run_at(address: str) -> dict[str, str]:
     return there
 
 
-def _fetch(address: str, folder: Path, there: Mapping[str, str]) -> None:
+def _fetch(address: str, folder: Path, there: Mapping[str, str], *, typed_in: Path | None) -> None:
     if folder.exists():
         raise FileExistsError(f"{folder} is there already")
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
@@ -113,9 +124,17 @@ def _fetch(address: str, folder: Path, there: Mapping[str, str]) -> None:
         for name in there:
             path = inside(partial, name)
             path.parent.mkdir(parents=True, exist_ok=True)
-            with _telling(address, "read"):
-                store.get_file(f"{root}/{name}", str(path))
+            try:
+                with _telling(address, "read"):
+                    store.get_file(f"{root}/{name}", str(path))
+            except FileNotFoundError as error:
+                raise UserError(f"{address} changed while it was fetched: give the same command again.") from error
         _keep_index(partial, address, _stamps(partial))
+        try:
+            begun = dict(read_json(partial / BEGUN))
+        except (ValueError, TypeError) as error:
+            raise UserError(f"{address}/{BEGUN} is damaged: restore it.") from error
+        write_json(partial / BEGUN, {**begun, "folder": None if typed_in is None else str(typed_in)})
         partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -160,26 +179,45 @@ def update(folder: Path, address: str) -> None:
     Raises:
         UserError: The store cannot be written.
     """
+    if not (folder / BEGUN).is_file():  # nothing that could go on
+        return
+    marks = {name: _read(folder / name) for name in (_STAGES, _RESULT) if (folder / name).is_file()}
+    now = {name: stamp for name, stamp in _stamps(folder).items() if name not in (_STAGES, _RESULT)}
+    before = _copied_before(folder, address)
+    done = {name: stamp for name, stamp in before.items() if name in now or name in marks}
     store, root = _store(address)
-    marks = {name: (folder / name).read_bytes() for name in _MARKS if (folder / name).is_file()}
-    now, before = _stamps(folder), _copied_before(folder, address)
-    changed = [name for name in now if now[name] != before.get(name) and name not in _MARKS]
-    done = {name: before[name] for name in now if name in before}
+
+    def mark(name: str) -> None:
+        if name in marks and marks[name].stamp != before.get(name):
+            store.pipe_file(f"{root}/{name}", marks[name].content)
+            done[name] = marks[name].stamp
+
     with _telling(address, "written"):
-        for name in changed:
-            with suppress(FileNotFoundError):  # removed meanwhile: the next time sees it
-                store.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
-                store.put_file(str(folder / name), f"{root}/{name}")
-                done[name] = now[name]
-        for name, content in marks.items():
-            if now.get(name) != before.get(name):
-                store.pipe_file(f"{root}/{name}", content)
-                done[name] = now.get(name, [])
-        for name in before.keys() - now.keys():
+        for name in sorted(now, key=lambda name: name != BEGUN):
+            if now[name] != before.get(name):
+                with suppress(FileNotFoundError):  # removed meanwhile: the next time sees it
+                    store.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
+                    store.put_file(str(folder / name), f"{root}/{name}")
+                    done[name] = now[name]
+        mark(_STAGES)
+        for name in before.keys() - done.keys():
             with suppress(FileNotFoundError):
                 store.rm_file(f"{root}/{name}")
+        mark(_RESULT)
     if done != before:
         _keep_index(folder, address, done)
+
+
+class _Mark(NamedTuple):
+    """A file that says that others are whole, as it is copied once they are."""
+
+    stamp: list[int]
+    content: bytes
+
+
+def _read(path: Path) -> _Mark:
+    stat = path.stat()
+    return _Mark([stat.st_size, stat.st_mtime_ns], path.read_bytes())
 
 
 def _check_free(folder: Path, address: str) -> None:
@@ -187,7 +225,7 @@ def _check_free(folder: Path, address: str) -> None:
     there = _files(address)
     if not there or _copied_before(folder, address):
         return
-    if "overrides.json" not in there:
+    if BEGUN not in there:
         raise UserError(f"copy_to = {address} holds other files: choose another address.")
     raise UserError(
         f"copy_to = {address} holds a run already. Go on with it by memcomp-train resume={address}, or choose "

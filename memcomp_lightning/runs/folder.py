@@ -105,7 +105,7 @@ class RunFolder:
     @property
     def typed_in(self) -> Path:
         """The folder in which the run was started: relative paths in its overrides start there."""
-        return Path((self._read("overrides.json") or {}).get("folder", Path.cwd()))
+        return Path((self._read("overrides.json") or {}).get("folder") or Path.cwd())
 
     @property
     def version(self) -> str:

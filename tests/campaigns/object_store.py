@@ -25,7 +25,7 @@ from ledger import Outcome
 from moto.server import ThreadedMotoServer
 
 ADDRESS = "s3://runs/mine"
-COPIED = (f"copy_to={ADDRESS}", "copy_every=0.1")
+COPIED = ("copy_every=0.1", f"copy_to={ADDRESS}")
 MOST_KILLS = 3
 
 TRIED = ("greedy", "joint", "machine", "table with gaps, classes", "early stopping", "mode-assisted", "figure")

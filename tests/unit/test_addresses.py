@@ -90,14 +90,48 @@ def test_a_file_that_says_that_others_are_whole_is_copied_after_them(
     assert b"finetune" in store.cat_file("/bucket/runs/mine/stages.json")
 
 
+def test_a_file_that_is_gone_is_removed_before_the_run_is_said_to_be_done(
+    store: fsspec.AbstractFileSystem, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a machine that is lost in between leaves a checkpoint for ever: a run that is done does not go on."""
+    update(run, AT)
+    (run / "weights/pretrain.pt").unlink()
+    (run / "result.json").write_text("{}")
+    seen, remove = list[set[str]](), type(store).rm_file
+
+    def removing(self: fsspec.AbstractFileSystem, there: str) -> None:
+        seen.append(names(store))
+        remove(self, there)
+
+    monkeypatch.setattr(type(store), "rm_file", removing)
+    update(run, AT)
+    assert seen == [{"overrides.json", "weights/pretrain.pt", "stages.json"}]
+
+
+def test_what_has_not_begun_is_not_copied(store: fsspec.AbstractFileSystem, run: Path) -> None:
+    (run / "overrides.json").rename(run / "later")
+    update(run, AT)
+    assert names(store) == set()
+    update(run.with_name("vanished"), AT)
+    assert names(store) == set()
+
+
+def test_a_damaged_run_is_not_fetched(store: fsspec.AbstractFileSystem, run: Path, tmp_path: Path) -> None:
+    (run / "overrides.json").write_text("[1]")
+    update(run, AT)
+    with pytest.raises(UserError, match=f"{AT}/overrides.json is damaged"):
+        fetch(AT, tmp_path / "elsewhere")
+
+
 def test_a_run_is_fetched_whole(store: fsspec.AbstractFileSystem, run: Path, tmp_path: Path) -> None:
     update(run, AT)
     there = tmp_path / "elsewhere"
     fetch(AT, there)
     assert (there / "weights/pretrain.pt").read_bytes() == b"weights"
-    store.rm_file("/bucket/runs/mine/overrides.json")
+    assert json.loads((there / "overrides.json").read_text()) == {"folder": str(Path.cwd())}
+    store.rm_file("/bucket/runs/mine/weights/pretrain.pt")
     update(there, AT)  # its copies are known: nothing is written that has not changed
-    assert "overrides.json" not in names(store)
+    assert names(store) == {"overrides.json", "stages.json"}
 
 
 def test_nothing_is_fetched_over_a_folder(store: fsspec.AbstractFileSystem, run: Path) -> None:
