@@ -21,6 +21,7 @@ from hydra.plugins.completion_plugin import CompletionPlugin
 
 from memcomp_lightning.configuration.quoting import hydra_value, quoted, with_path
 from memcomp_lightning.errors import UserError
+from memcomp_lightning.runs.addresses import is_address
 from memcomp_lightning.runs.paths import is_path
 
 SHOWING = ("help", "hydra_help", "cfg", "info", "shell_completion")
@@ -158,7 +159,7 @@ def from_folder(override: str, folder: Path) -> str:
     if folder == Path.cwd() or not is_path(name) or name.startswith("~"):
         return override
     value = hydra_value(text)
-    if not isinstance(value, str) or not value or value.startswith(("/", "~", "${")):
+    if not isinstance(value, str) or not value or value.startswith(("/", "~", "${")) or is_address(value):
         return override
     return with_path(name, folder / value)
 
@@ -191,6 +192,8 @@ def _readable(override: str, *, multirun: bool) -> str:
         swept = multirun and name not in _NEVER_SWEPT and not is_file(text)
         return _path(name, text, swept=swept)
     text = text.strip()
+    if name == "copy_to" and is_address(unquoted(text)):
+        return with_path(name, unquoted(text))
     readable = f"{name}={'null' if text == 'None' else text}"
     if parse(readable).is_sweep_override() and not multirun:
         hint = _one_value(name, text)

@@ -11,13 +11,13 @@ from omegaconf import DictConfig
 
 from memcomp_lightning.cli.arguments import expanded, from_folder, parse, read, unquoted
 from memcomp_lightning.cli.launched import launched
-from memcomp_lightning.cli.overrides import with_search_path
+from memcomp_lightning.cli.overrides import check_is_folder, with_search_path
 from memcomp_lightning.configuration.composition import SEARCH_PATH, search_paths
 from memcomp_lightning.configuration.continued import finished
 from memcomp_lightning.configuration.errors import CONFIGURATION_ERRORS
 from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.errors import UserError
-from memcomp_lightning.runs.addresses import fetch, fetched, is_address, name_of
+from memcomp_lightning.runs.addresses import BEGUN, address_of, fetch, is_address, name_of, read_at
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.paths import is_path
 from memcomp_lightning.runs.trust import foreign, require_no_links
@@ -54,7 +54,9 @@ class Written:
             UserError: They set what Hydra does, or look for settings where nobody trusts them.
         """
         found = [from_folder(override, self.folder.typed_in) for override in self.folder.overrides or []]
-        found = [override for override in found if not self._copies(override)]
+        self._require_said_where(found)
+        anew = {"copy_to", *({"copy_every"} & set(map(_name, self.typed)))}
+        found = [override for override in found if _name(override) not in anew]
         if self.setting == "continue" and (choice := (self.folder.result or {}).get("choice")):
             if type(choice.get("value")) not in (int, float):
                 raise UserError(f"continue={self.folder.path}: result.json is damaged: its choice is no number.")
@@ -65,20 +67,18 @@ class Written:
         self._refuse({entry: f"{entry}, where settings would be looked for" for entry in self._places(found)})
         return found
 
-    def _copies(self, override: str) -> bool:
-        """Whether an override sends the run somewhere, which is for those who go on with it to say.
-
-        Raises:
-            UserError: They do not say whether it goes there.
-        """
-        name, _, address = override.partition("=")
-        if name == "copy_to" and self.setting == "resume" and "copy_to" not in map(_name, self.typed):
-            line = shlex.join(["memcomp-train", f"resume={self.folder.path}", override, *self.typed])
-            raise UserError(
-                f"resume={self.folder.path}: this run was copied to {address}. Copy it there again with {line}, "
-                "or type copy_to=null in its place."
-            )
-        return name in ("copy_to", "copy_every")
+    def _require_said_where(self, overrides: Sequence[str]) -> None:
+        """Raise a UserError where a run was copied somewhere, and who goes on does not say whether it is to be."""
+        typed = [unquoted(o.partition("=")[2]) for o in overrides if _name(o) == "copy_to"]
+        address = address_of(self.folder.path) or next((text for text in typed if is_address(text)), None)
+        if self.setting != "resume" or address is None or "copy_to" in map(_name, self.typed):
+            return
+        at = f"resume={self.folder.path}"
+        line = shlex.join(["memcomp-train", at, with_path("copy_to", address), *self.typed])
+        raise UserError(
+            f"{at}: this run was copied to {address}. Copy it there again with {line}, or type copy_to=null for "
+            "none."
+        )
 
     def _check_text(self, override: str) -> None:
         """Raise a UserError for what could stand for anything, or lead Hydra elsewhere."""
@@ -208,21 +208,25 @@ def _brought_here(address: str, arguments: Sequence[str]) -> list[str]:
     """Fetch a run from an address; return the overrides that say where it is now, and where it is copied to.
 
     Raises:
-        UserError: Something is in the way, or several processes would fetch it.
+        UserError: Another run is in the way, or several processes would fetch it.
     """
-    if launched() is not None:
-        raise UserError(
-            f"resume={address}: several processes would fetch it. Fetch it to a disk that all of them see."
-        )
     typed = [a.partition("=")[2] for a in arguments if a.startswith("hydra.run.dir=")]
-    folder = Path(unquoted(typed[-1])) if typed else Path("runs", name_of(address))
-    if folder.exists():
+    folder = Path("runs", name_of(address))
+    if typed:
+        check_is_folder("hydra.run.dir", unquoted(typed[-1]))
+        folder = Path(expanded("hydra.run.dir", unquoted(typed[-1])))
+    own = [with_path("hydra.run.dir", folder), with_path("copy_to", address)]
+    if not (folder / BEGUN).is_file():
+        if launched() is not None:
+            line = shlex.join(["memcomp-train", f"resume={address}", own[0], "--cfg", "job"])
+            raise UserError(f"resume={address}: several processes would fetch it. Let one fetch it: {line}")
+        fetch(address, folder)
+    elif address_of(folder) != address:
         raise UserError(
-            f"resume={address}: {folder} is there already. Go on in it with resume={folder} copy_to={address}, or "
-            "fetch the run to another folder with hydra.run.dir=FOLDER."
+            f"resume={address}: {folder} holds another run. Let this one be fetched to another folder with "
+            "hydra.run.dir=FOLDER."
         )
-    fetch(address, folder)
-    return [with_path("hydra.run.dir", folder), f"copy_to={address}"]
+    return own
 
 
 def _continued(name: str, arguments: Sequence[str], trusted: Collection[str]) -> tuple[list[str], Written]:
@@ -231,7 +235,9 @@ def _continued(name: str, arguments: Sequence[str], trusted: Collection[str]) ->
     What is typed takes the place of a setting of the run, another option of a group that of all settings in it.
     A setting that the run chose by held-out images keeps the value that was chosen.
     """
-    folder = finished(fetched(name) if is_address(name) else Path(expanded("continue", name)).absolute())
+    place = name if is_address(name) else str(Path(expanded("continue", name)).absolute())
+    with read_at(place) as there:
+        folder = finished(there)
     typed = [argument for argument in arguments if not argument.startswith("continue=")]
     written = Written("continue", folder, typed, trusted)
     earlier = written.overrides()
@@ -243,7 +249,7 @@ def _continued(name: str, arguments: Sequence[str], trusted: Collection[str]) ->
         )
     anew = tuple(f"{name}." for name, option in given.items() if "." not in name and options.get(name) != option)
     kept = [o for o in earlier if _name(o) not in {*given, *_BEGINS} and not _name(o).startswith(anew)]
-    return [*kept, *typed, with_path("continue", folder.path)], written
+    return [*kept, *typed, with_path("continue", place)], written
 
 
 def _search_path(overrides: Sequence[str]) -> list[str]:

@@ -88,7 +88,7 @@ def check_command_line(
         overrides = with_search_path(overrides, line.config_dir)
     key = "hydra.sweep.dir" if line.multirun else "hydra.run.dir"
     if not line.shows:
-        _check_is_folder(key, line.value(key))
+        check_is_folder(key, line.value(key))
         _check_writable(Path(line.value(key) or folders[line.multirun]), key)
     folder: str | None = None
     root: Path | None = None
@@ -353,7 +353,7 @@ def with_search_path(overrides: Sequence[str], folder: Path | None) -> list[str]
     return [f"{SEARCH_PATH}{places}", *(o for o in overrides if o not in given)]
 
 
-def _check_is_folder(name: str, value: str | None) -> None:
+def check_is_folder(name: str, value: str | None) -> None:
     """Raise a UserError for the address of an object store, which would become a folder of that name."""
     if value is not None and is_address(value):
         raise UserError(

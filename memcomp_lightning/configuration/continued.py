@@ -12,6 +12,7 @@ from memcomp_lightning.configuration.composition import study_of
 from memcomp_lightning.data.schema import Schema, schema_of
 from memcomp_lightning.errors import UserError, require
 from memcomp_lightning.modules.weights import load_weights, read_checkpoint
+from memcomp_lightning.runs.addresses import read_at
 from memcomp_lightning.runs.folder import RunFolder
 
 _INITIAL = ("weights", "weight_init", "output_init")
@@ -71,7 +72,8 @@ def earlier_of(config: DictConfig) -> Earlier | None:
     """
     if config.get("continue") is None:
         return None
-    folder = finished(Path(config["continue"]))
+    with read_at(str(config["continue"])) as path:
+        folder = finished(path)
     settings = folder.settings
     assert settings is not None
     require(config.model.weights is None, "model.weights", config.model.weights, "null with continue=FOLDER")

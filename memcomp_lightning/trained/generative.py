@@ -13,7 +13,7 @@ def load_generative(path: str | Path, *, pretrained: bool = False) -> Generative
     """Read the generative model that a run with ``updown=contrastive`` has trained.
 
     Args:
-        path: The run folder.
+        path: The run folder, or its address.
         pretrained: Take the weights that up-down training began with, the same ones in both directions, without
             labels; for these the run may have been any of a DBN.
 
@@ -21,7 +21,7 @@ def load_generative(path: str | Path, *, pretrained: bool = False) -> Generative
         UserError: The run has none.
     """
     run = load(path)
-    network, where = run.network, RunFolder(Path(path)).weights("updown")
+    network, where = run.network, RunFolder(run.path).weights("updown")
     if not isinstance(network, DBN):
         kind = type(network).__name__
         raise UserError(f"{path} has a {kind}, which is no deep belief network: train with model=dbn.")

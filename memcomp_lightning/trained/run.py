@@ -16,7 +16,7 @@ from memcomp_lightning.data.schema import ImageSchema, Schema, schema_of
 from memcomp_lightning.errors import Told, UserError, require
 from memcomp_lightning.models import DBM, DBN, EnergyModel
 from memcomp_lightning.models.units import Units
-from memcomp_lightning.runs.addresses import fetched, is_address
+from memcomp_lightning.runs.addresses import is_address, read_at
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.trust import check_targets, forget_lost_initialisers, resolved
 from memcomp_lightning.trained.alone import network_of as network_alone
@@ -130,7 +130,11 @@ def load(
     Raises:
         UserError, CheckpointError: There is no finished training; the message says what is needed.
     """
-    path = fetched(str(path)) if is_address(str(path)) else Path(path)
+    if is_address(str(path)):
+        _require_no_schema(schema, "a run folder has its own")
+        with read_at(str(path)) as folder:
+            return _of_folder(folder, replica, trusted)
+    path = Path(path)
     if path.is_dir():
         _require_no_schema(schema, "a run folder has its own")
         return _of_folder(path, replica, trusted)

@@ -3,8 +3,9 @@
 ``pip install s3fs 'moto[server]'``, then ``python tests/campaigns/object_store.py --out FOLDER --count 60``. A
 case is ``KIND/SEED``, and has a server that speaks S3 (moto), with an empty bucket. The run is begun with
 ``copy_to=s3://runs/mine`` and killed, with all its processes, after a share of the time that an uninterrupted run
-takes; its folder is removed. It is resumed from the address, killed again perhaps, and resumed until it is done.
-Then the folder and the copy are compared with what an uninterrupted run left, bit for bit but for times.
+takes; its folder is removed. It goes on by ``resume=ADDRESS`` or by the same command, is killed again perhaps,
+and goes on until it is done. Then the folder and the copy are compared with what an uninterrupted run left, bit
+for bit but for times.
 """
 
 import os
@@ -51,10 +52,12 @@ def _files() -> fsspec.AbstractFileSystem:
     return fsspec.filesystem("s3", skip_instance_cache=True)
 
 
-def begun(kind: Kind, folder: Path, environment: dict[str, str], seconds: float | None = None) -> Ended:
+def begun(
+    kind: Kind, folder: Path, environment: dict[str, str], seconds: float | None = None, *, resumes: bool = False
+) -> Ended:
     """Begin a run, or go on with its copy; end it after some seconds, if it has not ended by then."""
     arguments = (*kind.arguments, *COPIED)
-    if _files().exists(f"{ADDRESS}/overrides.json"):
+    if resumes and _files().exists(f"{ADDRESS}/overrides.json"):
         arguments = (f"resume={ADDRESS}", "hydra.run.dir=run", "copy_every=0.1")
     signals = [] if seconds is None else [(seconds, 9)]
     return live("train", arguments, folder, signals=signals, **environment)
@@ -90,8 +93,9 @@ def attempt(case: str, *, folder: Path) -> Outcome:
             for number in range(1 + MOST_KILLS):
                 here = own / f"machine{number}"
                 shutil.copytree(place / "before", here)
-                share = draws.random()
-                last = begun(kind, here, environment, None if number == MOST_KILLS else share * seconds)
+                share, resumes = draws.random(), draws.random() < 0.5
+                limit = None if number == MOST_KILLS else share * seconds
+                last = begun(kind, here, environment, limit, resumes=resumes)
                 if last.status >= 0:
                     break
                 lost += 1

@@ -10,6 +10,7 @@ from memcomp_lightning.cli.output import refuse, say
 from memcomp_lightning.configuration.errors import in_words
 from memcomp_lightning.errors import SettingError, UserError, lost
 from memcomp_lightning.files import write_text
+from memcomp_lightning.runs.addresses import fetched, is_address
 from memcomp_lightning.runs.table import aligned, short_path
 from memcomp_lightning.runs.trust import require_no_links
 from memcomp_lightning.studies.page import page
@@ -33,12 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prog=COMMAND,
         description="Write figures, tables and verdicts of runs like memcomp-train experiment=figure4.",
     )
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="folder of a run of a figure")
-    parser.add_argument("--output", type=Path, help="the page; default: report.html in the first folder")
+    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="folder of a run of a figure, or its address")
+    parser.add_argument("--output", type=Path, help="the page; default: report.html in the first folder, or here")
     parser.error = lambda message: refuse(COMMAND, UserError(f"{message}. {COMMAND} --help shows how."))  # type: ignore[method-assign]
     given = parser.parse_args(arguments)
     try:
-        write(given.folders, given.output or given.folders[0] / "report.html")
+        folders = [fetched(folder) if is_address(folder) else Path(folder) for folder in given.folders]
+        beside = Path() if is_address(given.folders[0]) else folders[0]
+        write(folders, given.output or beside / "report.html")
     except (UserError, SettingError, OSError) as error:
         again = shlex.join([COMMAND, *(sys.argv[1:] if arguments is None else arguments)])
         said = lost(error)

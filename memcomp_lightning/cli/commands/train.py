@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import hydra
+from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning_utilities.core.rank_zero import rank_zero_only
@@ -33,11 +34,12 @@ from memcomp_lightning.configuration.continued import earlier_of
 from memcomp_lightning.configuration.errors import explain, in_words
 from memcomp_lightning.configuration.hydra_versions import MAIN, instantiate
 from memcomp_lightning.configuration.plans import build, check_without_trainer
+from memcomp_lightning.configuration.quoting import with_path
 from memcomp_lightning.configuration.trainers import check_trainers, trainer_of
 from memcomp_lightning.errors import SettingError, UserError, require, require_count
 from memcomp_lightning.modules import CheckpointError
 from memcomp_lightning.runs import pipeline
-from memcomp_lightning.runs.addresses import check_address, copied, is_address
+from memcomp_lightning.runs.addresses import NotCopiedError, address_of, check_address, copying, is_address
 from memcomp_lightning.runs.folder import RunFolder
 from memcomp_lightning.runs.history import history_with
 from memcomp_lightning.runs.lock import InUseError
@@ -48,6 +50,8 @@ COMMAND = "memcomp-train"
 
 _ALONE = {"worth": comparisons, "density": densities, "few_labels": few_labels}
 """What checks and trains a study that is no figure, by its setting."""
+
+_DAY = 86_400
 
 log = logging.getLogger(__name__)
 
@@ -67,11 +71,21 @@ def train(config: DictConfig) -> float | None:
     os.chdir(settings.runtime.cwd)  # paths are meant from there, with hydra.job.chdir=true, too
     folder = RunFolder(Path(settings.runtime.output_dir))
     in_sweep = settings.mode == RunMode.MULTIRUN
+    score: float | None = None
     try:
-        trains = _is_first_process() and folder.result is None
-        address = _copy_to(config, folder if in_sweep else None) if _is_first_process() else None
-        with folder.held() if trains else nullcontext(), copied(folder.path, address, config.copy_every):
-            return _train(config, folder, [*search_path(settings), *settings.overrides.task])
+        address = _address(config, folder, settings) if _is_first_process() else None
+        trains, alone = _is_first_process() and folder.result is None, launched.launched() is None
+        with (
+            folder.held() if trains else nullcontext(),
+            copying(folder.path, address, config.copy_every, fetches=alone),
+        ):
+            score = _train(config, folder, [*search_path(settings), *settings.overrides.task])
+    except NotCopiedError as error:
+        again = shlex.join([COMMAND, with_path("resume", short_path(folder.path)), *_copies(folder)])
+        said = UserError(f"{error} The run is whole in {short_path(folder.path)}. Copy it with: {again}")
+        if not in_sweep:
+            refuse(COMMAND, said)
+        log.error("%s", said)
     except Exception as error:
         if not in_sweep and isinstance(error, (UserError, SettingError, CheckpointError, DivergedError)):
             refuse(COMMAND, error)
@@ -83,11 +97,15 @@ def train(config: DictConfig) -> float | None:
                 folder.fail(record)
         log.error("Failed, the sweep goes on: %s", explain(error))
         return 0.0 if isinstance(error, DivergedError) else None
+    return score
 
 
-def _copy_to(config: DictConfig, job: RunFolder | None) -> str | None:
-    """The address of the run, or of a job of a sweep, which has its folder's name there; None without."""
-    return config.copy_to if job is None or config.copy_to is None else f"{config.copy_to}/{job.path.name}"
+def _address(config: DictConfig, folder: RunFolder, settings: HydraConf) -> str | None:
+    """Where the run is copied to, a job of a sweep by the name of its folder there; None if nowhere."""
+    if config.copy_to is None or settings.mode != RunMode.MULTIRUN:
+        return None if config.copy_to is None else str(config.copy_to)
+    job = os.path.relpath(folder.path, settings.sweep.dir).replace(os.sep, "/")
+    return f"{str(config.copy_to).rstrip('/')}/{job}"
 
 
 def _check(config: DictConfig, overrides: Sequence[str]) -> None:
@@ -95,7 +113,7 @@ def _check(config: DictConfig, overrides: Sequence[str]) -> None:
     if config.copy_to is not None:
         of_store = is_address(str(config.copy_to))
         require(of_store, "copy_to", config.copy_to, "an address, s3://bucket/run or file:///folder")
-        require(config.copy_every > 0, "copy_every", config.copy_every, "seconds > 0")
+        require(0 < config.copy_every <= _DAY, "copy_every", config.copy_every, f"seconds in (0, {_DAY}]")
         check_address(config.copy_to)
     if study_of(config) is not None:
         allowed = "null: figures and comparisons train new networks"
@@ -199,8 +217,9 @@ def _open(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) -> No
         folder.open(config, overrides)
 
 
-def _copies(config: DictConfig) -> list[str]:
-    return [] if config.copy_to is None else [f"copy_to={config.copy_to}"]
+def _copies(folder: RunFolder) -> list[str]:
+    address = address_of(folder.path)
+    return [] if address is None else [with_path("copy_to", address)]
 
 
 @contextmanager
@@ -208,7 +227,7 @@ def _resumable(folder: RunFolder, config: DictConfig, overrides: Sequence[str]) 
     """Name the command that goes on where a run that has begun is ended from outside."""
 
     def command() -> str:
-        beside = [*to_trust(config, overrides, folder.path), *_copies(config)]
+        beside = [*to_trust(config, overrides, folder.path), *_copies(folder)]
         return shlex.join([COMMAND, f"resume={short_path(folder.path)}", *beside])
 
     try:
