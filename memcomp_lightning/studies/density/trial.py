@@ -27,8 +27,8 @@ ENUMERATED, ENUMERATED_AT_END = 16, 25
 """Units of the smaller layer up to which log Z is exact, along a training and at its end."""
 
 THOROUGH = 10
-"""How many times the steps of AIS are made where a pass looks best so far: of many estimates of log Z the best pass
-may be the one whose estimate missed most of it, and the lower of both likelihoods counts."""
+"""How many times the steps of AIS are made where a pass looks best so far: it may look so by an estimate of log Z
+that missed more of it than others did. The lower of both likelihoods counts."""
 
 SWEEPS = 200
 """From training rows to the states from which reverse AIS starts."""
