@@ -33,11 +33,11 @@ MOST_FILES = 100_000
 LONGEST_WAIT_S = 600.0
 """Seconds that the end of a run waits for the last copy."""
 
-_MARKS = ("stages.json", "result.json")
+_STAGES, _RESULT = "stages.json", "result.json"
 """Each says that others are whole. Its content is read first, then the folder is listed; it is copied last."""
 
 _NEEDLESS = re.compile(r"(.*/)?(checkpoints/.*|error\.json)")
-"""Files that a run removes when it no longer needs them. What else vanishes from a folder stays in its copy."""
+"""Files that a run removes when it needs them no longer. What else vanishes from a folder stays in its copy."""
 
 _VERSIONED_BY = ("ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "last_modified", "created")
 """What stores tell of a file that changes when it does; each has some of them."""
@@ -212,7 +212,7 @@ class Copy:
                 )
             fetch(address, folder)
             self._done = _stamps(folder)
-        self._there = {name for name in there if _NEEDLESS.fullmatch(name)}
+        self._needless = {name for name in there if _NEEDLESS.fullmatch(name)}
         self._id = uuid.uuid4().hex
         # Both are known in between: a kill leaves the folder the owner.
         write_json(folder / OWNER, {"id": theirs, "next": self._id, "address": address})
@@ -243,32 +243,33 @@ class Copy:
             raise UserError(
                 f"{self._store.address}: another process has gone on with this copy; it is left alone."
             )
-        gone = self._there - _stamps(self._folder).keys()
-        marks = {name: (self._folder / name).read_bytes() for name in _MARKS if (self._folder / name).is_file()}
-        now = _stamps(self._folder)
-        changed = [name for name in now if now[name] != self._done.get(name) and name not in _MARKS]
-        for name in sorted(changed, key=lambda name: name != BEGUN):
-            if self._put(name, self._folder / name):
-                self._done[name] = now[name]
-                self._there |= {name} if _NEEDLESS.fullmatch(name) else set()
-        for name in _MARKS:
-            if name == _MARKS[-1]:
-                for needless in gone:
-                    self._store.remove(needless)
-                self._there -= gone
-                self._done = {name: stamp for name, stamp in self._done.items() if name not in gone}
-            if name in marks and now.get(name) != self._done.get(name) and self._put(name, marks[name]):
-                self._done[name] = now.get(name, [])
+        before = _stamps(self._folder)
+        marks = {name: (self._folder / name).read_bytes() for name in (_STAGES, _RESULT) if name in before}
+        now = {name: stamp for name, stamp in _stamps(self._folder).items() if name not in (_STAGES, _RESULT)}
+        for name in sorted(now, key=lambda name: name != BEGUN):
+            self._copy(name, self._folder / name, now[name])
+        if _STAGES in marks:
+            self._copy(_STAGES, marks[_STAGES], before[_STAGES])
+        for needless in self._needless - before.keys():
+            self._store.remove(needless)
+            self._needless.remove(needless)
+            self._done.pop(needless, None)
+        if _RESULT in marks:
+            self._copy(_RESULT, marks[_RESULT], before[_RESULT])
 
-    def _put(self, name: str, content: Path | bytes) -> bool:
-        """Copy a file; False if it was removed meanwhile, which the next time sees."""
+    def _copy(self, name: str, content: Path | bytes, stamp: list[int]) -> None:
+        """Copy a file that has changed; one that was removed meanwhile is seen the next time."""
+        if self._done.get(name) == stamp:
+            return
         try:
             self._store.put(name, content)
         except FileNotFoundError as error:
             if isinstance(content, bytes) or content.exists():
                 raise UserError(f"{self._store.address} is not there any more ({error}).") from error
-            return False
-        return True
+            return
+        self._done[name] = stamp
+        if _NEEDLESS.fullmatch(name):
+            self._needless.add(name)
 
 
 def _copy_until(copy: Copy, every_s: float, ended: threading.Event, failed: list[Exception]) -> None:

@@ -174,6 +174,24 @@ def test_a_stage_that_ends_while_the_folder_is_listed_keeps_its_checkpoint(
     assert CHECKPOINT not in names(store)
 
 
+def test_a_mark_that_changes_while_it_is_read_is_copied_again(
+    store: Store, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy, stamps, calls = Copy(run, AT), addresses._stamps, list[int]()
+
+    def listing(folder: Path) -> dict[str, list[int]]:
+        calls.append(1)
+        if len(calls) == 2:  # marks have been read
+            (run / "stages.json").write_text('{"pretrain": {}, "finetune": {}}')
+        return stamps(folder)
+
+    monkeypatch.setattr(addresses, "_stamps", listing)
+    copy.update()
+    assert b"finetune" not in store.cat_file("/bucket/runs/mine/stages.json")
+    copy.update()
+    assert b"finetune" in store.cat_file("/bucket/runs/mine/stages.json")
+
+
 def test_what_has_not_begun_is_not_copied(store: Store, run: Path) -> None:
     (run / "overrides.json").rename(run / "later")
     copy = Copy(run, AT)
