@@ -179,7 +179,8 @@ def copying(folder: Path, address: str | None, every_s: float, *, fetches: bool 
         return
     copy = Copy(folder, address, fetches=fetches)
     ended, failed = threading.Event(), list[Exception]()
-    copier = threading.Thread(target=_copy_until, args=(copy, every_s, ended, failed), daemon=True)
+    work = (copy, every_s, ended, failed)
+    copier = threading.Thread(target=_copy_until, name=f"copying to {address}", args=work, daemon=True)
     copier.start()
     try:
         yield

@@ -473,6 +473,9 @@ def test_a_store_that_does_not_answer_does_not_hold_the_run(
     with pytest.raises(NotCopiedError, match=f"{AT} does not answer"), copying(run, AT, 60):
         pass
     released.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("copying to "):
+            thread.join()
 
 
 def test_a_place_that_vanishes_is_told(store: Store, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
