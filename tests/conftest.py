@@ -12,6 +12,7 @@ import functools
 import importlib
 import inspect
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,10 @@ from beartype import beartype
 from jaxtyping import AbstractArray, install_import_hook
 
 from memcomp_lightning import rng
+
+# A shell lets what it starts in the background ignore Ctrl-C, which some tests send.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if SEED := os.environ.get("MEMCOMP_SEED"):
 
