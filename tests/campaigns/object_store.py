@@ -39,11 +39,12 @@ def store() -> Iterator[dict[str, str]]:
     server.start()
     try:
         endpoint = f"http://127.0.0.1:{server.get_host_and_port()[1]}"
-        found = {"AWS_ENDPOINT_URL": endpoint, "AWS_ACCESS_KEY_ID": "nobody", "AWS_SECRET_ACCESS_KEY": "nothing"}
-        os.environ.update(found, AWS_DEFAULT_REGION="us-east-1")
+        found = {"AWS_ENDPOINT_URL": endpoint, "AWS_DEFAULT_REGION": "us-east-1"}
+        found |= {"AWS_ACCESS_KEY_ID": "nobody", "AWS_SECRET_ACCESS_KEY": "nothing"}
+        os.environ.update(found)
         urlopen(Request(f"{endpoint}/moto-api/reset", method="POST"))  # all servers of a process have one memory
         _files().mkdir("runs")
-        yield {**found, "AWS_DEFAULT_REGION": "us-east-1"}
+        yield found
     finally:
         server.stop()
 

@@ -103,7 +103,8 @@ class DensityTrial(Trial):
                 betas, chains = self.density.quick_betas, self.density.chains
                 of_rows = scores_of(model, train, [held_out, train], betas, chains, enumerated=ENUMERATED)
                 valid = of_rows[0].least.masked_fill(diverged, -math.inf)
-                if best.value is None or bool((valid > best.value).any()):
+                looks_best = best.value is None or bool((valid > best.value).any())
+                if looks_best and model.n_enumerated > ENUMERATED:
                     thorough = scores_of(model, train, [held_out], THOROUGH * betas, chains, enumerated=ENUMERATED)
                     valid = torch.minimum(valid, thorough[0].least)
                 best.offer(valid, trained.state_dict())
